@@ -1,0 +1,22 @@
+"""The one exception for input that a user can mend."""
+
+from __future__ import annotations
+
+
+class InputError(Exception):
+    """Bad data or a bad setting: says where, what was expected, what was found and what to do.
+
+    The command line prints it as one line and exits with status 2; it is never raised for a defect of our own.
+    """
+
+    def __init__(self, where: str, *, expected: str, found: str, do: str = "") -> None:
+        self.where, self.expected, self.found, self.do = where, expected, found, do
+        message = f"{where}: expected {expected}, found {found}"
+        super().__init__(f"{message}; {do}" if do else message)
+
+    def __reduce__(self):  # keyword-only arguments do not survive the default way between processes
+        return _rebuild, (self.where, self.expected, self.found, self.do)
+
+
+def _rebuild(where: str, expected: str, found: str, do: str) -> InputError:
+    return InputError(where, expected=expected, found=found, do=do)

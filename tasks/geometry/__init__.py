@@ -1,0 +1,1 @@
+"""What every stage shares: rotations, rigid transforms, skinning, kinematics, meshes, neighbours."""

@@ -1,0 +1,237 @@
+"""The typed values that stages hand to each other.
+
+Symbols as in the paper: F frames, N points, B bones, J joints, M curve nodes, C clips. Lengths are in the unit of the
+data (``Motion.unit``), angles in radians, +Y is up. A transform is a (3, 4) matrix [A | t] that acts on *canonical*
+points: x = A v + t. Everything is float32 unless said otherwise; sums that need it are taken in float64.
+
+A value holds arrays, strings, numbers, tuples of strings, other values or None, and nothing else: that is what lets
+the store write it without pickle.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from tasks.errors import InputError
+
+
+@dataclass(frozen=True)
+class Rig:
+    """A skeleton that came with the data: the truth that estimated skeletons are held against.
+
+    names: J joint names; parents: (J,) int32, -1 for the root, which is joint 0, every parent before its children;
+    joints: (J, 3) rest positions; weights: (N, J) skin weights, rows sum to one;
+    rotations: (F, J, 3, 3) local to the parent, relative to rest; translations: (F, J, 3) see :class:`Poses`.
+    """
+
+    names: tuple[str, ...]
+    parents: np.ndarray
+    joints: np.ndarray
+    weights: np.ndarray
+    rotations: np.ndarray
+    translations: np.ndarray
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A moving shape of fixed topology.
+
+    points: (F, N, 3); faces: (T, 3) int32 or None for bare points; clip_start: (C+1,) int64, clip c is
+    frames clip_start[c]:clip_start[c+1]; clip_names: C names; fps: frames a second; unit: "m" or "unit" (unknown scale);
+    rest: (N, 3) rest shape, where the data has one; rig: its skeleton, where the data has one.
+    """
+
+    name: str
+    points: np.ndarray
+    faces: np.ndarray | None
+    clip_start: np.ndarray
+    clip_names: tuple[str, ...]
+    fps: float
+    unit: str = "unit"
+    rest: np.ndarray | None = None
+    rig: Rig | None = None
+
+    def __post_init__(self) -> None:
+        _check(self.points.ndim == 3 and self.points.shape[2] == 3, "Motion.points", "(F, N, 3)", self.points.shape)
+        start = np.asarray(self.clip_start)
+        frames = len(self.points)
+        well_formed = start.ndim == 1 and len(start) >= 2 and start[0] == 0 and start[-1] == frames
+        _check(
+            well_formed and bool(np.all(np.diff(start) > 0)),
+            "Motion.clip_start",
+            f"rising frame numbers from 0 to {frames}",
+            start.tolist(),
+        )
+        _check(len(self.clip_names) == len(start) - 1, "Motion.clip_names", f"{len(start) - 1} names", self.clip_names)
+
+    @property
+    def frames(self) -> int:
+        """Number of frames F."""
+        return len(self.points)
+
+    def clips(self) -> list[slice]:
+        """The frames of each clip."""
+        return [slice(int(a), int(b)) for a, b in zip(self.clip_start[:-1], self.clip_start[1:], strict=True)]
+
+    def take_clips(self, chosen: list[int]) -> Motion:
+        """The motion made of the chosen clips, in the order given."""
+        return self.take_frames([self.clips()[c] for c in chosen], [self.clip_names[c] for c in chosen])
+
+    def take_frames(self, pieces: list[slice], names: list[str]) -> Motion:
+        """The motion made of runs of consecutive frames; each run becomes a clip, so no window can cross a cut."""
+        index = np.concatenate([np.arange(p.start, p.stop) for p in pieces])
+        start = np.concatenate([[0], np.cumsum([p.stop - p.start for p in pieces])]).astype(np.int64)
+        rig = self.rig
+        if rig is not None:
+            rig = replace(rig, rotations=rig.rotations[index], translations=rig.translations[index])
+        return replace(self, points=self.points[index], clip_start=start, clip_names=tuple(names), rig=rig)
+
+
+@dataclass(frozen=True)
+class Canonical:
+    """The shape that bones and skeleton are defined on. points: (N, 3); faces: (T, 3) int32 or None; frame: its index
+    among the training frames, or -1 for the data's own rest shape; source: how it was chosen."""
+
+    points: np.ndarray
+    faces: np.ndarray | None
+    frame: int
+    source: str
+
+
+@dataclass(frozen=True)
+class Clusters:
+    """Rigid motion clusters. labels: (N,) int32 in 0..B-1; transforms: (F, B, 3, 4);
+    curve_count, curve_error: the counts tried and the vertex RMSE at each (the automatic choice, for the report)."""
+
+    labels: np.ndarray
+    transforms: np.ndarray
+    curve_count: np.ndarray
+    curve_error: np.ndarray
+
+
+@dataclass(frozen=True)
+class Skinning:
+    """Free-form bones. weights: (N, B), rows sum to one, few non-zeros; transforms: (F, B, 3, 4) on canonical points;
+    rest: (N, 3) canonical points; history: (iterations,) objective, vertex RMSE."""
+
+    rest: np.ndarray
+    weights: np.ndarray
+    transforms: np.ndarray
+    history: np.ndarray
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A closed surface round the canonical shape. vertices: (V, 3); faces: (T, 3) int32;
+    of_point: (N,) int32, the vertex nearest to each canonical point."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    of_point: np.ndarray
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A curve skeleton. nodes: (M, 3); edges: (E, 2) int32, a forest; of_vertex: (V,) int32, the node every surface
+    vertex collapsed onto; of_point: (N,) int32, the same for canonical points."""
+
+    nodes: np.ndarray
+    edges: np.ndarray
+    of_vertex: np.ndarray
+    of_point: np.ndarray
+
+
+@dataclass(frozen=True)
+class Skeleton:
+    """A kinematic tree with skin weights. names: J names; parents: (J,) int32, joint 0 is the only root (-1), every
+    parent before its children; joints: (J, 3) canonical positions; weights: (N, J), rows sum to one."""
+
+    names: tuple[str, ...]
+    parents: np.ndarray
+    joints: np.ndarray
+    weights: np.ndarray
+
+    def __post_init__(self) -> None:
+        parents = np.asarray(self.parents)
+        ordered = len(parents) > 0 and parents[0] == -1 and all(0 <= p < j for j, p in enumerate(parents[1:], start=1))
+        _check(ordered, "Skeleton.parents", "one root at index 0 and every parent before its children", parents.tolist())
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Poses of a skeleton. rotations: (F, J, 3, 3) local to the parent, identity at rest;
+    translations: (F, J, 3) shift of the joint from its rest offset, in the parent's frame (the root's in the world's;
+    for the others zero unless the data's own skeleton stretches); clip_start: (C+1,) int64 as in :class:`Motion`."""
+
+    rotations: np.ndarray
+    translations: np.ndarray
+    clip_start: np.ndarray
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Overlapping groups of joints. names: P names; joints: (P, J) bool; roots: (P,) int32, each part's root joint;
+    affinity: (P, B) how much each bone follows each part, columns used as blend weights."""
+
+    names: tuple[str, ...]
+    joints: np.ndarray
+    roots: np.ndarray
+    affinity: np.ndarray
+
+
+@dataclass(frozen=True)
+class Database:
+    """Training poses (the key) and bones (the value), frame by frame; windows are cut when matching.
+    poses: the training poses; bones: (F, B, 3, 4) transforms on canonical points; fps: frames a second."""
+
+    poses: Poses
+    bones: np.ndarray
+    fps: float
+
+
+@dataclass(frozen=True)
+class Animation:
+    """What a method makes of unseen poses. points: (F, N, 3); bones: (F, B, 3, 4) or None where a method has none;
+    sources: (F, P, K) int32 training frames blended for each part, or None; distance: (F, P) distance of the query to
+    its best match in radians, or None; parts: P names."""
+
+    points: np.ndarray
+    bones: np.ndarray | None = None
+    sources: np.ndarray | None = None
+    distance: np.ndarray | None = None
+    parts: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Metrics:
+    """Numbers of one case. names: metric names, units: theirs, values: (K,) float64."""
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    values: np.ndarray
+
+
+VALUES = {
+    kind.__name__: kind
+    for kind in (
+        Rig, Motion, Canonical, Clusters, Skinning, Surface, Curve, Skeleton, Poses, Parts, Database, Animation, Metrics,
+    )
+}  # fmt: skip
+
+
+def same(a: object, b: object) -> bool:
+    """True when two values hold the same bits."""
+    if type(a) is not type(b):
+        return False
+    if isinstance(a, np.ndarray):
+        return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
+    if type(a) in VALUES.values():
+        return all(same(getattr(a, f.name), getattr(b, f.name)) for f in fields(a))
+    return a == b
+
+
+def _check(ok: bool, where: str, expected: str, found: object) -> None:
+    if not ok:
+        raise InputError(where, expected=expected, found=str(found))

@@ -39,8 +39,8 @@ class Motion:
     """A moving shape of fixed topology.
 
     points: (F, N, 3); faces: (T, 3) int32 or None for bare points; clip_start: (C+1,) int64, clip c is
-    frames clip_start[c]:clip_start[c+1]; clip_names: C names; fps: frames a second; unit: "m" or "unit" (unknown scale);
-    rest: (N, 3) rest shape, where the data has one; rig: its skeleton, where the data has one.
+    frames clip_start[c]:clip_start[c+1]; clip_names: C names; fps: frames a second; unit: "m" or
+    "unit" (unknown scale); rest: (N, 3) rest shape, where the data has one; rig: its skeleton, where the data has one.
     """
 
     name: str
@@ -156,7 +156,8 @@ class Skeleton:
     def __post_init__(self) -> None:
         parents = np.asarray(self.parents)
         ordered = len(parents) > 0 and parents[0] == -1 and all(0 <= p < j for j, p in enumerate(parents[1:], start=1))
-        _check(ordered, "Skeleton.parents", "one root at index 0 and every parent before its children", parents.tolist())
+        expected = "one root at index 0 and every parent before its children"
+        _check(ordered, "Skeleton.parents", expected, parents.tolist())
 
 
 @dataclass(frozen=True)
@@ -213,12 +214,23 @@ class Metrics:
     values: np.ndarray
 
 
+@dataclass(frozen=True)
+class Training:
+    """All that a method may learn from: nothing of the test clips is in here."""
+
+    motion: Motion
+    canonical: Canonical
+    skinning: Skinning
+    skeleton: Skeleton
+    database: Database
+    parts: Parts
+
+
 VALUES = {
     kind.__name__: kind
-    for kind in (
-        Rig, Motion, Canonical, Clusters, Skinning, Surface, Curve, Skeleton, Poses, Parts, Database, Animation, Metrics,
-    )
-}  # fmt: skip
+    for kind in (Rig, Motion, Canonical, Clusters, Skinning, Surface, Curve, Skeleton, Poses, Parts, Database)
+    + (Training, Animation, Metrics)
+}
 
 
 def same(a: object, b: object) -> bool:

@@ -1,4 +1,7 @@
-"""Rotations in three dimensions: matrices (..., 3, 3), unit quaternions (..., 4) as w x y z, rotation vectors (..., 3)."""
+"""Rotations in three dimensions.
+
+Matrices (..., 3, 3), unit quaternions (..., 4) as w x y z, rotation vectors (..., 3) in radians.
+"""
 
 from __future__ import annotations
 

@@ -226,11 +226,8 @@ class Training:
     parts: Parts
 
 
-VALUES = {
-    kind.__name__: kind
-    for kind in (Rig, Motion, Canonical, Clusters, Skinning, Surface, Curve, Skeleton, Poses, Parts, Database)
-    + (Training, Animation, Metrics)
-}
+_KINDS = (Rig, Motion, Canonical, Clusters, Skinning, Surface, Curve, Skeleton, Poses, Parts, Database, Training)
+VALUES = {kind.__name__: kind for kind in (*_KINDS, Animation, Metrics)}
 
 
 def same(a: object, b: object) -> bool:

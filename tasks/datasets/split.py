@@ -1,0 +1,161 @@
+"""Training and test frames that share nothing."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from tasks.errors import InputError
+from tasks.geometry.measure import diagonal
+from tasks.values import Motion
+
+SAME = 1e-5  # of the diagonal: two frames whose points all lie this close are the same frame
+MOSTLY = 0.5  # a test clip of which more than this share repeats training frames tests nothing
+LIVELY = 0.5  # of the median clip's movement: below this a clip is not chosen as a test by itself
+LANDMARKS = 16  # points compared first when looking for equal frames
+
+
+def split(motion: Motion, *, by: Literal["clips", "frames"], test: list[str], fraction: float) -> tuple[Motion, Motion]:
+    """(train, test), each contiguous run of frames a clip of its own, so that no window crosses a cut.
+
+    by="clips": the clips named in `test`; when it is empty, :func:`choose_clips` picks about `fraction` of them.
+    by="frames": the last `fraction` of every clip; `test` must be empty.
+
+    Frames at which the test repeats a training frame (clips often start from one neutral pose) are left out of the
+    test. Raises InputError when a test clip repeats training frames for the most part, when either side has no
+    frames, and for unknown names.
+    """
+    if by == "clips":
+        train, held = _by_clips(motion, test, fraction)
+    else:
+        if test:
+            raise InputError("split.test", expected="no names when split.by=frames", found=_list(test))
+        train, held = _by_frames(motion, fraction)
+    return train, _without_repeats(train, held)
+
+
+def choose_clips(motion: Motion, count: int) -> list[int]:
+    """Picks test clips by rule, never by result: the same data always give the same clips.
+
+    A clip qualifies when it moves at least half as much as the median clip (see :func:`liveliness`: idle clips, which
+    barely move, test nothing) and when at most half of its frames occur in another clip. The qualified are put in order
+    of movement, cut into `count` equal stretches, and the middle one of each is taken: calm and lively, no extremes.
+    """
+    moves = liveliness(motion)
+    qualified = [
+        c
+        for c, frames in enumerate(motion.clips())
+        if moves[c] >= LIVELY * np.median(moves)
+        and np.mean(_repeats(_others(motion, c), motion.points[frames]) >= 0) <= MOSTLY
+    ]
+    if not qualified:
+        raise InputError(
+            "split.test",
+            expected="a clip that moves and does not repeat another",
+            found="none",
+            do="name the test clips, or set split.by=frames",
+        )
+    count = min(count, len(qualified))
+    ordered = sorted(qualified, key=lambda c: (moves[c], c))
+    return sorted(ordered[int((i + 0.5) * len(ordered) / count)] for i in range(count))
+
+
+def liveliness(motion: Motion) -> np.ndarray:
+    """How much each clip moves: RMS distance of the points from the clip's mean shape once every frame is shifted to
+    one centroid, in the data's unit. (C,)"""
+    out = []
+    for frames in motion.clips():
+        shape = motion.points[frames].astype(np.float64)
+        shape -= shape.mean(1, keepdims=True)
+        out.append(np.sqrt(((shape - shape.mean(0)) ** 2).sum(-1).mean()))
+    return np.array(out)
+
+
+def _by_clips(motion: Motion, test: list[str], fraction: float) -> tuple[Motion, Motion]:
+    names = motion.clip_names
+    if len(names) < 2:
+        raise InputError(
+            "split.by", expected="at least two clips", found=f"one clip in {motion.name}", do="set split.by=frames"
+        )
+    unknown = [name for name in test if name not in names]
+    if unknown:
+        raise InputError("split.test", expected=f"names among {_list(names)}", found=_list(unknown))
+    if test:
+        chosen = [c for c, name in enumerate(names) if name in test]
+    else:
+        _check_fraction(fraction)
+        chosen = choose_clips(motion, min(max(1, round(fraction * len(names))), len(names) - 1))
+    kept = [c for c in range(len(names)) if c not in chosen]
+    if not kept:
+        raise InputError("split.test", expected="a clip left to train on", found="every clip named as a test")
+    return motion.take_clips(kept), motion.take_clips(chosen)
+
+
+def _by_frames(motion: Motion, fraction: float) -> tuple[Motion, Motion]:
+    _check_fraction(fraction)
+    cuts = [(c.start, c.stop - round(fraction * (c.stop - c.start)), c.stop) for c in motion.clips()]
+    train = [(slice(a, cut), name) for (a, cut, _), name in zip(cuts, motion.clip_names, strict=True) if cut > a]
+    test = [(slice(cut, b), name) for (_, cut, b), name in zip(cuts, motion.clip_names, strict=True) if b > cut]
+    for side, runs in (("training", train), ("test", test)):
+        if not runs:
+            longest = int(np.diff(motion.clip_start).max())
+            found = f"zero frames with split.fraction={fraction} of clips of {longest} frames at most"
+            raise InputError("split.fraction", expected=f"{side} frames", found=found, do="change split.fraction")
+    return tuple(motion.take_frames([p for p, _ in runs], [n for _, n in runs]) for runs in (train, test))
+
+
+def _without_repeats(train: Motion, test: Motion) -> Motion:
+    """The test without frames that training has; InputError where that takes the most of a clip."""
+    source = _repeats(train.points, test.points)
+    if (source < 0).all():
+        return test
+    runs, names = [], []
+    for name, clip in zip(test.clip_names, test.clips(), strict=True):
+        seen = source[clip] >= 0
+        if seen.mean() > MOSTLY:
+            first = int(np.flatnonzero(seen)[0])
+            raise InputError(
+                f"{test.name}: test clip {name}",
+                expected="frames that training does not have",
+                found=f"{seen.sum()} of {len(seen)} repeat training frames (its frame {first} is training frame "
+                f"{source[clip.start + first]} of clip {_clip_of(train, source[clip.start + first])})",
+                do="remove the repeated frames from the data, or choose other test clips or another fraction",
+            )
+        edges = np.flatnonzero(np.diff(np.concatenate([[1], seen, [1]])))
+        for k, (a, b) in enumerate(zip(edges[::2], edges[1::2], strict=True)):
+            runs.append(slice(clip.start + int(a), clip.start + int(b)))
+            names.append(name if k == 0 else f"{name} ({k + 1})")
+    return test.take_frames(runs, names)
+
+
+def _repeats(known: np.ndarray, asked: np.ndarray) -> np.ndarray:
+    """For each frame asked, the first known frame with the same points, or -1. known: (F, N, 3); asked: (G, N, 3)."""
+    step = max(1, known.shape[1] // LANDMARKS)
+    near = SAME * diagonal(known[0])
+    marks = cKDTree(known[:, ::step].reshape(len(known), -1))
+    out = np.full(len(asked), -1, np.int64)
+    # a frame within `near` in every coordinate lies within `near` in the maximum norm of the landmarks
+    for g, close in enumerate(marks.query_ball_point(asked[:, ::step].reshape(len(asked), -1), near, p=np.inf)):
+        equal = [f for f in close if np.abs(known[f] - asked[g]).max() <= near]
+        out[g] = min(equal, default=-1)
+    return out
+
+
+def _others(motion: Motion, clip: int) -> np.ndarray:
+    frames = motion.clips()[clip]
+    return np.delete(motion.points, np.r_[frames], axis=0)
+
+
+def _clip_of(motion: Motion, frame: int) -> str:
+    return motion.clip_names[int(np.searchsorted(motion.clip_start, frame, side="right")) - 1]
+
+
+def _check_fraction(fraction: float) -> None:
+    if not 0 < fraction < 1:
+        raise InputError("split.fraction", expected="a number between 0 and 1", found=str(fraction))
+
+
+def _list(names: list[str] | tuple[str, ...]) -> str:
+    return ", ".join(names)

@@ -1,0 +1,185 @@
+"""The numbers of a case: every metric's unit and direction is declared here, once.
+
+A vertex error is the distance between a result's point and the true one. Lengths are reported in millimetres where the
+data is in metres and in the data's own unit elsewhere; percentages are of the canonical bounding box's diagonal.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from tasks.geometry import kinematics, measure
+from tasks.geometry.skinning import skin
+from tasks.values import Animation, Metrics, Motion, Training
+
+FRAMES_AT_ONCE = 64  # bounds the memory of float64 differences; sums are per frame, so it does not change a bit
+
+
+@dataclass(frozen=True)
+class Metric:
+    """label: a column's heading; kind: what it measures, which decides its unit (see :func:`unit_of`);
+    better: which way is good ("one": the nearer to 1 the better, "none": information, never ranked);
+    text: one line for readers; digits: decimals in tables, or None for three significant ones."""
+
+    label: str
+    kind: Literal["length", "speed", "percent", "ratio", "count", "decibel", "hours"]
+    better: Literal["lower", "higher", "one", "none"]
+    text: str
+    digits: int | None = None
+
+
+METRICS: dict[str, Metric] = {
+    "rmse": Metric("RMSE", "length", "lower", "vertex RMSE on unseen clips, sqrt(sum |d|^2 / (F N))"),
+    "rmse_pct": Metric("RMSE", "percent", "lower", "the same in % of the canonical bounding box's diagonal", 2),
+    "rmse_coordinate": Metric("RMSE per coordinate", "length", "lower", "sqrt(sum |d|^2 / (3 F N))"),
+    "max_error": Metric("largest error", "length", "lower", "largest vertex error of any point in any frame"),
+    "velocity_rmse": Metric("velocity RMSE", "speed", "lower", "RMSE of the points' velocities, inside clips"),
+    "speed_ratio": Metric("speed ratio", "ratio", "one", "mean speed of the result over the true one: liveliness", 2),
+    "bones_rmse": Metric("bones RMSE", "length", "lower", "compression: bones alone on the frames they were fitted to"),
+    "bones_rmse_pct": Metric("bones RMSE", "percent", "lower", "the same in % of the diagonal", 3),
+    "skeleton_rmse": Metric("skeleton RMSE", "length", "lower", "LBS of the skeleton alone on the training frames"),
+    "skeleton_rmse_pct": Metric("skeleton RMSE", "percent", "lower", "the same in % of the diagonal", 2),
+    "bones_count": Metric("bones", "count", "none", "number of free-form bones B", 0),
+    "joints_count": Metric("joints", "count", "none", "number of joints J", 0),
+    "parts_count": Metric("parts", "count", "none", "number of body parts that are matched on their own", 0),
+    "psnr": Metric("PSNR", "decibel", "higher", "peak signal-to-noise ratio of rendered images", 2),
+    "ssim": Metric("SSIM", "ratio", "higher", "structural similarity of rendered images", 3),
+    "lpips": Metric("LPIPS", "ratio", "lower", "learned perceptual distance of rendered images", 4),
+    "optimise_hours": Metric("optimisation", "hours", "lower", "time to optimise one scene", 2),
+}
+
+_FIXED_UNITS = {"percent": "%", "ratio": "ratio", "count": "count", "decibel": "dB", "hours": "h"}
+
+
+def metric_of(name: str) -> Metric:
+    """The declaration behind a metric's name; "rmse@walk" is rmse on the clip walk."""
+    return METRICS[name.split("@", 1)[0]]
+
+
+def unit_of(kind: str, data_unit: str) -> tuple[str, float]:
+    """The unit a kind of number is reported in and the factor that takes it there from the data's unit."""
+    if kind not in ("length", "speed"):
+        return _FIXED_UNITS[kind], 1.0
+    unit, factor = ("mm", 1000.0) if data_unit == "m" else ("unit", 1.0)
+    return (f"{unit}/s" if kind == "speed" else unit), factor
+
+
+def score(value: float, better: str) -> float:
+    """A number that is smaller for a better value: what ranks compare."""
+    if better == "one":
+        return abs(math.log(value)) if value > 0 else math.inf
+    return -value if better == "higher" else value
+
+
+def evaluate(animation: Animation, test: Motion, training: Training) -> Metrics:
+    """All numbers of one case: the result against the unseen clips, and what it was made of.
+
+    animation.points: (F, N, 3), the result on the frames of ``test``. The metrics ``rmse`` and ``rmse_pct`` are also
+    given for each test clip, as "rmse@clip". Velocities are left out where no clip has two frames, the speed ratio
+    where the truth stands still. Raises ValueError where the result has another shape than the truth or is not finite.
+    """
+    found = _animation_numbers(animation.points, test, measure.diagonal(training.canonical.points))
+    found.update(_training_numbers(training))
+    units = {name: unit_of(metric_of(name).kind, test.unit) for name in found}
+    return Metrics(
+        names=tuple(found),
+        units=tuple(units[name][0] for name in found),
+        values=np.array([found[name] * units[name][1] for name in found], np.float64),
+    )
+
+
+def squared_errors(points: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Squared vertex errors in float64. points, truth: (F, N, 3) -> (F, N)."""
+    if points.shape != truth.shape:
+        raise ValueError(f"a result of shape {points.shape} cannot be held against a truth of shape {truth.shape}")
+    out = np.empty(points.shape[:2], np.float64)
+    for a in range(0, len(points), FRAMES_AT_ONCE):
+        piece = slice(a, a + FRAMES_AT_ONCE)
+        out[piece] = np.sum((points[piece].astype(np.float64) - truth[piece]) ** 2, axis=-1)
+    if not np.isfinite(out).all():
+        raise ValueError(f"the result is not finite in frame {int(np.argmin(np.isfinite(out).all(1)))}")
+    return out
+
+
+def frame_rmse(points: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Vertex RMSE of each frame. points, truth: (F, N, 3) -> (F,)."""
+    return np.sqrt(squared_errors(points, truth).mean(1))
+
+
+def clip_keys(names: tuple[str, ...]) -> list[str]:
+    """Names that tell clips apart: their own, with their number where two share a name."""
+    if len(set(names)) == len(names):
+        return list(names)
+    return [f"{name}#{c}" for c, name in enumerate(names)]
+
+
+def _animation_numbers(points: np.ndarray, test: Motion, diagonal: float) -> dict[str, float]:
+    squared = squared_errors(points, test.points)
+    rmse = math.sqrt(squared.mean())
+    found = {
+        "rmse": rmse,
+        "rmse_pct": 100.0 * rmse / diagonal,
+        "rmse_coordinate": rmse / math.sqrt(3.0),
+        "max_error": math.sqrt(squared.max()),
+    }
+    found.update(_velocity_numbers(points, test))
+    for key, clip in zip(clip_keys(test.clip_names), test.clips(), strict=True):
+        clip_rmse = math.sqrt(squared[clip].mean())
+        found[f"rmse@{key}"] = clip_rmse
+        found[f"rmse_pct@{key}"] = 100.0 * clip_rmse / diagonal
+    return found
+
+
+def _velocity_numbers(points: np.ndarray, test: Motion) -> dict[str, float]:
+    """Differences of neighbouring frames times the frame rate; never across a clip's end."""
+    error, speed, true_speed, count = 0.0, 0.0, 0.0, 0
+    for clip in test.clips():
+        for f in range(clip.start + 1, clip.stop):
+            made = points[f].astype(np.float64) - points[f - 1]
+            true = test.points[f].astype(np.float64) - test.points[f - 1]
+            error += float(np.sum((made - true) ** 2))
+            speed += float(np.linalg.norm(made, axis=-1).sum())
+            true_speed += float(np.linalg.norm(true, axis=-1).sum())
+            count += len(made)
+    if count == 0:
+        return {}
+    found = {"velocity_rmse": test.fps * math.sqrt(error / count)}
+    if true_speed > 0:
+        found["speed_ratio"] = speed / true_speed
+    return found
+
+
+def _training_numbers(training: Training) -> dict[str, float]:
+    skinning, skeleton, poses = training.skinning, training.skeleton, training.database.poses
+    diagonal = measure.diagonal(training.canonical.points)
+
+    def bones(piece: slice) -> np.ndarray:
+        return skin(skinning.rest, skinning.weights, skinning.transforms[piece])
+
+    def joints(piece: slice) -> np.ndarray:
+        rotations, shifts = poses.rotations[piece], poses.translations[piece]
+        transforms = kinematics.forward(skeleton.parents, skeleton.joints, rotations, shifts)
+        return skin(training.canonical.points, skeleton.weights, transforms)
+
+    bones_rmse = _rmse_in_pieces(bones, training.motion.points)
+    skeleton_rmse = _rmse_in_pieces(joints, training.motion.points)
+    return {
+        "bones_rmse": bones_rmse,
+        "bones_rmse_pct": 100.0 * bones_rmse / diagonal,
+        "skeleton_rmse": skeleton_rmse,
+        "skeleton_rmse_pct": 100.0 * skeleton_rmse / diagonal,
+        "bones_count": float(skinning.transforms.shape[1]),
+        "joints_count": float(len(skeleton.parents)),
+        "parts_count": float(len(training.parts.names)),
+    }
+
+
+def _rmse_in_pieces(make: Callable[[slice], np.ndarray], truth: np.ndarray) -> float:
+    """Vertex RMSE of a motion that is made a few frames at a time, so that it never lies in memory whole."""
+    pieces = [slice(a, min(a + FRAMES_AT_ONCE, len(truth))) for a in range(0, len(truth), FRAMES_AT_ONCE)]
+    return math.sqrt(np.concatenate([squared_errors(make(p), truth[p]).mean(1) for p in pieces]).mean())

@@ -1,0 +1,67 @@
+"""metrics.csv: one row a number."""
+
+from __future__ import annotations
+
+import io
+import math
+
+import pandas as pd
+
+from tasks.errors import InputError
+from tasks.values import Metrics
+
+COLUMNS = ("experiment", "dataset", "subject", "method", "variant", "metric", "value", "unit", "seed", "key")
+
+
+def rows_of(
+    metrics: Metrics,
+    *,
+    experiment: str,
+    dataset: str,
+    subject: str,
+    method: str,
+    variant: str,
+    seed: int,
+    key: str,
+) -> pd.DataFrame:
+    """One case's numbers as rows with the columns ``COLUMNS``. key: the case's content digest."""
+    count = len(metrics.names)
+    shared = {"experiment": experiment, "dataset": dataset, "subject": subject, "method": method, "variant": variant}
+    table = {name: [value] * count for name, value in shared.items()}
+    table["metric"] = list(metrics.names)
+    table["value"] = [float(v) for v in metrics.values]
+    table["unit"] = list(metrics.units)
+    table["seed"] = [int(seed)] * count
+    table["key"] = [key] * count
+    return pd.DataFrame(table, columns=list(COLUMNS))
+
+
+def join(pieces: list[pd.DataFrame]) -> pd.DataFrame:
+    """The rows of several cases in the order given; an empty frame of the right columns for none."""
+    return pd.concat(pieces, ignore_index=True) if pieces else pd.DataFrame(columns=list(COLUMNS))
+
+
+def to_csv(rows: pd.DataFrame) -> str:
+    """The text of metrics.csv. Floats are written with as few digits as give back the same bits, so equal rows give
+    equal bytes. Raises ValueError on a value that is not finite."""
+    bad = [v for v in rows["value"] if not math.isfinite(v)]
+    if bad:
+        raise ValueError(f"metrics.csv holds finite numbers only, got {bad[0]}")
+    return rows[list(COLUMNS)].to_csv(index=False, lineterminator="\n", float_format=lambda v: repr(float(v)))
+
+
+def from_csv(text: str, where: str) -> pd.DataFrame:
+    """Reads what :func:`to_csv` wrote, to the last bit. where: the file's name, for the error.
+
+    Raises InputError where a column is missing or a value is not a number.
+    """
+    header = text.split("\n", 1)[0].split(",")
+    if header != list(COLUMNS):
+        raise InputError(where, expected=f"the columns {','.join(COLUMNS)}", found=",".join(header))
+    rows = pd.read_csv(io.StringIO(text), dtype=str, keep_default_na=False)
+    try:  # Python's own float() gives back the bits on every version of pandas
+        rows["value"] = [float(v) for v in rows["value"]]
+        rows["seed"] = [int(v) for v in rows["seed"]]
+    except ValueError as error:
+        raise InputError(where, expected="numbers in the columns value and seed", found=str(error)) from error
+    return rows

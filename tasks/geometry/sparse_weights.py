@@ -1,0 +1,158 @@
+"""Skin weights of given transforms: per point, the sparse convex combination that follows the motion best."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from tasks.geometry.moments import homogeneous
+from tasks.geometry.parallel import for_chunks
+
+CHUNK = 512
+_RIDGE = 1e-9
+
+
+def fit_weights(
+    rest: np.ndarray, points: np.ndarray, transforms: np.ndarray, *, influences: int, exchanges: int
+) -> np.ndarray:
+    """min sum_f |sum_b w_b T_fb h_n - x_fn|^2 with w >= 0, sum w = 1 and at most ``influences`` non-zeros
+    (Le & Deng 2012, eq. 3-6, solved by exchange over all transforms rather than over a list of candidates).
+
+    rest: (N, 3); points: (F, N, 3); transforms: (F, B, 3, 4) -> (N, B) float32. Sums over frames are taken first, so
+    the solve of a point does not grow with F.
+    """
+    frames, bones = transforms.shape[:2]
+    t = transforms.astype(np.float64).transpose(0, 2, 1, 3).reshape(3 * frames, 4 * bones)
+    gram = (t.T @ t).reshape(bones, 4, bones, 4).transpose(1, 3, 0, 2).reshape(16, bones * bones)
+    h = homogeneous(rest)
+
+    def part(a: int, b: int) -> np.ndarray:
+        x = points[:, a:b].astype(np.float64).transpose(1, 0, 2).reshape(b - a, 3 * frames)
+        hh = (h[a:b, :, None] * h[a:b, None]).reshape(b - a, 16)
+        quadratic = (hh @ gram).reshape(b - a, bones, bones)
+        linear = ((x @ t).reshape(b - a, bones, 4) * h[a:b, None]).sum(2)
+        # with sum w = 1 the error is w^T q w; q is the Gram matrix of the single-bone residuals
+        q = quadratic - linear[:, :, None] - linear[:, None, :] + (x * x).sum(1)[:, None, None]
+        return _solve_points(q, influences, exchanges)
+
+    return np.concatenate(for_chunks(part, len(rest), CHUNK)).astype(np.float32)
+
+
+@njit(cache=True, nogil=True)
+def _solve_points(q: np.ndarray, influences: int, exchanges: int) -> np.ndarray:
+    out = np.zeros(q.shape[:2])
+    for n in range(len(q)):
+        _solve_point(q[n], influences, exchanges, out[n])
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _solve_point(q: np.ndarray, influences: int, exchanges: int, w: np.ndarray) -> None:
+    """Start from the best single bone; add the bone of steepest descent; above the limit drop the least useful."""
+    bones = len(q)
+    support = np.empty(influences + 1, np.int64)
+    values = np.zeros(influences + 1)
+    best = 0
+    for b in range(bones):
+        if q[b, b] < q[best, best]:
+            best = b
+    support[0], values[0], size = best, 1.0, 1
+    error = q[best, best]
+    tried = np.zeros(bones, np.bool_)
+    for _ in range(influences + exchanges):
+        add, slope = -1, error * (1.0 - 1e-6)
+        for b in range(bones):
+            if tried[b]:
+                continue
+            g = 0.0
+            for i in range(size):
+                g += q[b, support[i]] * values[i]
+            if g < slope:
+                add, slope = b, g
+        if add < 0:
+            break
+        tried[add] = True
+        new_support, new_values = support.copy(), values.copy()
+        new_support[size], new_values[size] = add, 0.0
+        new_size, new_error = _descend(q, new_support, new_values, size + 1)
+        if new_size > influences:
+            new_size, new_error = _drop_one(q, new_support, new_values, new_size)
+        if new_error < error * (1.0 - 1e-9):
+            support, values, size, error = new_support, new_values, new_size, new_error
+            for i in range(size):
+                tried[support[i]] = True
+    for i in range(size):
+        w[support[i]] = values[i]
+
+
+@njit(cache=True, nogil=True)
+def _drop_one(q: np.ndarray, support: np.ndarray, values: np.ndarray, size: int) -> tuple[int, float]:
+    """Tries to leave out each member in turn and keeps the set of least error."""
+    best_error, best_size = np.inf, 0
+    best_support, best_values = support.copy(), values.copy()
+    for leave in range(size):
+        s, v = support.copy(), values.copy()
+        for i in range(leave, size - 1):
+            s[i], v[i] = s[i + 1], v[i + 1]
+        k, e = _descend(q, s, v, size - 1)
+        if e < best_error:
+            best_error, best_size = e, k
+            best_support[:] = s
+            best_values[:] = v
+    support[:] = best_support
+    values[:] = best_values
+    return best_size, best_error
+
+
+@njit(cache=True, nogil=True)
+def _descend(q: np.ndarray, support: np.ndarray, values: np.ndarray, size: int) -> tuple[int, float]:
+    """Minimum of w^T q w over the simplex on ``support``: solve with the sum fixed, drop the most negative, repeat."""
+    while True:
+        w = _solve_ones(q, support, size)
+        w /= w.sum()
+        worst = 0
+        for i in range(size):
+            if w[i] < w[worst]:
+                worst = i
+        if w[worst] > 0.0 or size == 1:
+            break
+        for i in range(worst, size - 1):
+            support[i] = support[i + 1]
+        size -= 1
+    error = 0.0
+    for i in range(size):
+        values[i] = w[i]
+        for j in range(size):
+            error += w[i] * w[j] * q[support[i], support[j]]
+    return size, error
+
+
+@njit(cache=True, nogil=True)
+def _solve_ones(q: np.ndarray, support: np.ndarray, size: int) -> np.ndarray:
+    """Solves q[support, support] w = 1 by Cholesky; pivots are floored, since two bones may move alike."""
+    floor = 0.0
+    for i in range(size):
+        floor += _RIDGE * abs(q[support[i], support[i]])
+    floor += 1e-300
+    low = np.zeros((size, size))
+    w = np.ones(size)
+    for i in range(size):
+        for j in range(i + 1):
+            total = q[support[i], support[j]]
+            if i == j:
+                total += floor
+            for k in range(j):
+                total -= low[i, k] * low[j, k]
+            if i == j:
+                low[i, i] = np.sqrt(max(total, floor))
+            else:
+                low[i, j] = total / low[j, j]
+    for i in range(size):
+        for k in range(i):
+            w[i] -= low[i, k] * w[k]
+        w[i] /= low[i, i]
+    for i in range(size - 1, -1, -1):
+        for k in range(i + 1, size):
+            w[i] -= low[k, i] * w[k]
+        w[i] /= low[i, i]
+    return w

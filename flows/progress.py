@@ -1,0 +1,89 @@
+"""What a user sees while a sweep works: which stage, which case, cached or computed, seconds; then the tables."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from pathlib import Path
+
+from rich.console import Console
+from rich.live import Live
+from rich.spinner import Spinner
+from rich.table import Table
+from rich.text import Text
+
+from flows.graph import Graph, Node, short
+from flows.store import Ref
+
+
+class Progress:
+    """A line for every finished stage and a live line for the running ones; on a pipe, only the finished ones.
+
+    Workers report the start of a stage in a file of events, since they may be other processes.
+    """
+
+    def __init__(self, graph: Graph, show: bool = True) -> None:
+        self.total = len(graph.nodes)
+        self.finished = 0
+        self.console = Console(quiet=not show, highlight=False)
+        self._events: Path | None = None
+        self._read = 0
+        self._running: dict[tuple[str, str], float] = {}
+        self._lock = threading.Lock()
+        self._live = Live(console=self.console, get_renderable=self._now, refresh_per_second=4, transient=True)
+
+    def __enter__(self) -> Progress:
+        if self.console.is_terminal:
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._live.stop()
+
+    def follow(self, events: str) -> None:
+        """The file in which workers write what they start."""
+        with self._lock:
+            self._events, self._read, self._running = Path(events), 0, {}
+
+    def done(self, node: Node, ref: Ref) -> None:
+        """A stage finished."""
+        self.finished += 1
+        how = Text("cached  ", "dim") if ref.cached else Text("computed", "green")
+        took = "" if ref.cached else f"{ref.seconds:8.1f} s {ref.peak_mb:7.0f} MB"
+        self._line(node, how, took)
+
+    def failed(self, node: Node, error: BaseException) -> None:
+        """A stage failed; what does not depend on it goes on."""
+        self.finished += 1
+        self._line(node, Text("failed  ", "bold red"), f"  {type(error).__name__}")
+
+    def note(self, text: str) -> None:
+        """A remark that the user should see."""
+        self.console.print(Text(f"  {text}", "yellow"))
+
+    def _line(self, node: Node, how: Text, rest: str) -> None:
+        with self._lock:
+            self._running.pop((node.stage, short(node.cases)), None)
+        more = f" (+{len(node.cases) - 1} cases)" if len(node.cases) > 1 else ""
+        count = f"[{self.finished:{len(str(self.total))}}/{self.total}] "
+        self.console.print(Text.assemble((count, "dim"), how, f" {node.stage:<10} {node.cases[0]}{more}", rest))
+
+    def _now(self) -> Table:
+        self._poll()
+        table = Table.grid(padding=(0, 1))
+        with self._lock:
+            for (stage, case), since in self._running.items():
+                table.add_row(Spinner("dots"), stage, case, f"{time.time() - since:.0f} s")
+        return table
+
+    def _poll(self) -> None:
+        with self._lock:
+            try:
+                lines = self._events.read_text("utf-8").splitlines() if self._events else []
+            except OSError:
+                return
+            for line in lines[self._read :]:
+                event = json.loads(line)
+                self._running[event["stage"], event["case"]] = event["time"]
+            self._read = len(lines)

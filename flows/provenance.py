@@ -1,0 +1,88 @@
+"""Where a report's numbers come from: configs, code, versions, inputs, and what every stage cost."""
+
+from __future__ import annotations
+
+import platform
+import re
+import subprocess
+import sys
+from importlib.metadata import PackageNotFoundError, requires, version
+
+from flows.config import Case
+from flows.graph import Graph
+from flows.source import ROOT
+from flows.store import Ref
+
+PACKAGE = "skelebones"
+
+
+def provenance(cases: list[Case], graph: Graph, refs: dict[str, Ref], computed: set[str]) -> dict:
+    """A report's provenance as plain JSON."""
+    return {
+        "command": ["python", "-m", "flows.run", *sys.argv[1:]],
+        "git": git_state(),
+        "versions": versions(),
+        "machine": {"system": platform.platform(), "python": platform.python_version(), "cpu": platform.machine()},
+        "seeds": sorted({case.config["seed"] for case in cases}),
+        "inputs": inputs(graph),
+        "cases": [
+            {"dataset": c.dataset, "method": c.method, "variant": c.variant, "config": portable(c.config)}
+            for c in cases
+        ],
+        "stages": [
+            {
+                "stage": node.stage,
+                "cases": node.cases,
+                "key": refs[node.id].key,
+                "outputs": refs[node.id].outputs,
+                "how": "computed" if node.id in computed else "cached",
+                "seconds": refs[node.id].seconds,
+                "peak_mb": refs[node.id].peak_mb,
+            }
+            for node in graph.nodes.values()
+            if node.id in refs
+        ],
+    }
+
+
+def portable(config: dict) -> dict:
+    """A config without what belongs to one machine: the store, the runner, the folders of inputs and reports."""
+    kept = {name: value for name, value in config.items() if name not in ("store", "runner")}
+    if isinstance(kept["dataset"].get("path"), str):
+        kept["dataset"] = kept["dataset"] | {"path": kept["dataset"]["path"].replace("\\", "/").rpartition("/")[2]}
+    kept["report"] = {name: value for name, value in kept["report"].items() if name != "path"}
+    return kept
+
+
+def inputs(graph: Graph) -> dict[str, str]:
+    """Name of every input file or folder -> sha256 of its bytes."""
+    loaders = [node for node in graph.nodes.values() if node.files]
+    return {str(node.settings["path"]).replace("\\", "/").rpartition("/")[2]: node.files for node in loaders}
+
+
+def git_state() -> dict:
+    """Commit and whether the tree had changes; empty outside a checkout."""
+
+    def git(*arguments: str) -> str:
+        done = subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True, timeout=20, check=True)
+        return done.stdout.strip()
+
+    try:
+        return {"commit": git("rev-parse", "HEAD"), "changed": bool(git("status", "--porcelain", "-uno"))}
+    except (OSError, subprocess.SubprocessError):
+        return {}
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of what the project requires."""
+    found = {"python": platform.python_version()}
+    try:
+        required = [text for text in requires(PACKAGE) or () if "extra ==" not in text]
+    except PackageNotFoundError:
+        return found
+    for name in sorted(re.match(r"[\w.-]+", text).group() for text in required):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found

@@ -1,0 +1,159 @@
+"""What every key of the config may hold.
+
+The settings of a stage are the keyword-only arguments of its function, read from the source (see ``flows.source``), so
+a type is written once, where it is used. What belongs to the run and not to a stage is declared here.
+"""
+
+from __future__ import annotations
+
+import difflib
+import types
+import typing
+from typing import Literal
+
+from flows.source import choices, signature
+from tasks.errors import InputError
+
+CLUSTER = "tasks.bones.clustering:cluster"
+SSDR = "tasks.bones.ssdr:ssdr"
+RIGID = "tasks.bones.rigid:rigid_skinning"
+SPLIT = "tasks.datasets.split:split"
+CANONICAL = "tasks.datasets.canonical:canonical"
+SURFACE = "tasks.skeleton.surface:closed_surface"
+CURVE = "tasks.skeleton.curve:curve_skeleton"
+JOINTS = {
+    "motion": "tasks.skeleton.joints_motion:joints_by_motion",
+    "gradient": "tasks.skeleton.joints_gradient:joints_by_gradient",
+}
+GIVEN_SKELETON = "tasks.skeleton.given:given_skeleton"
+GIVEN_POSES = "tasks.skeleton.given:given_poses"
+POSES = "tasks.skeleton.poses:fit_poses"
+DATABASE = "tasks.motion.database:build_database"
+PARTS = "tasks.motion.parts:find_parts"
+EVALUATE = "tasks.evaluation.metrics:evaluate"
+
+FROM_RUN = {"seed"}  # arguments that come from the top of the config
+RENAMED = {"lambda_": "lambda"}  # Python keywords that are the field's names in the config
+
+
+def load_function(kind: str) -> str:
+    """The loader of a kind of dataset: ``tasks/datasets/<kind>.py``."""
+    choices("datasets", "dataset.kind", kind)
+    return f"tasks.datasets.{kind}:load"
+
+
+def animate_function(function: str) -> str:
+    """The method's function: ``tasks/methods/<function>.py``."""
+    choices("methods", "animate.function", function)
+    return f"tasks.methods.{function}:animate"
+
+
+def schema(config: dict) -> dict[str, object]:
+    """The type of every key that this config may have, nested as the config is."""
+    dataset, animate = config["dataset"], config["animate"]
+    skeleton: dict[str, object] = {"kind": Literal["curve", "given"]}
+    if config["skeleton"].get("kind") != "given":
+        skeleton |= {
+            "joints": Literal["motion", "gradient"],
+            "surface": settings(SURFACE),
+            "curve": settings(CURVE),
+            "poses": settings(POSES),
+            **{name: settings(function) for name, function in JOINTS.items()},
+        }
+    bones = {"decomposition": Literal["ssdr", "clusters"], **settings(CLUSTER)}
+    bones |= settings(SSDR if config["bones"].get("decomposition") != "clusters" else RIGID)
+    return {
+        "seed": int,
+        "dataset": {
+            "kind": str,
+            "status": Literal["paper", "substitute"],
+            "paper_column": str | None,
+            **settings(load_function(dataset.get("kind", ""))),
+        },
+        "split": settings(SPLIT),
+        "bones": bones,
+        "skeleton": skeleton | settings(CANONICAL, rename={"choice": "canonical"}),
+        "animate": {"name": str, "function": str, **settings(animate_function(animate.get("function", "")))},
+        "parts": settings(PARTS),
+        "evaluate": settings(EVALUATE),
+        "report": {"name": str, "path": str, "figures": bool, "baseline": str | None, "note": str},
+        "store": {"path": str},
+        "runner": {"kind": Literal["threads", "processes"], "workers": int},
+        "sweep": {"datasets": list[str] | None, "methods": list[str] | None, "ablations": list[str] | None},
+    }
+
+
+def settings(function: str, *, rename: dict[str, str] | None = None) -> dict[str, object]:
+    """Config key -> type for the settings of a function."""
+    names = RENAMED | (rename or {})
+    return {names.get(n, n): t for n, t in signature(function)[1].items() if n not in FROM_RUN}
+
+
+def arguments(function: str, node: dict, seed: int) -> dict[str, object]:
+    """The keyword arguments of a function, taken from its node of the config."""
+    values = {n: node[RENAMED.get(n, n)] for n in signature(function)[1] if n not in FROM_RUN}
+    return values | ({"seed": seed} if "seed" in signature(function)[1] else {})
+
+
+def check(config: dict, expected: dict[str, object], where: str = "") -> dict:
+    """The config with every value of its declared type. Raises InputError naming the first key that is not."""
+    for key in config:
+        if key not in expected:
+            raise unknown_key(f"{where}{key}", list(expected))
+    missing = [f"{where}{key}" for key in expected if key not in config]
+    if missing:
+        raise InputError(missing[0], expected="a value", found="nothing", do="add it to the yaml file of its group")
+    out = {}
+    for key, kind in expected.items():
+        path = f"{where}{key}"
+        if isinstance(kind, dict):
+            if not isinstance(config[key], dict):
+                raise InputError(path, expected=f"a group with {', '.join(kind)}", found=repr(config[key]))
+            out[key] = check(config[key], kind, f"{path}.")
+        else:
+            out[key] = _typed(config[key], kind, path)
+    return out
+
+
+def unknown_key(path: str, valid: list[str]) -> InputError:
+    """The error for a key that does not exist, with the nearest one that does."""
+    name = path.rpartition(".")[2]
+    near = difflib.get_close_matches(name, valid, 1)
+    hint = f"did you mean {near[0]}?" if near else "remove it"
+    return InputError(path, expected=f"one of the keys {', '.join(valid)}", found=f"the unknown key {name!r}", do=hint)
+
+
+def _typed(value: object, kind: object, path: str) -> object:
+    """The value as the type; a whole number may stand for a float, nothing else is converted."""
+    origin = typing.get_origin(kind)
+    if value == "???":  # OmegaConf's mark for a value that the user must give
+        raise InputError(path, expected=describe(kind), found="nothing", do=f"add {path}=… to the command")
+    if origin is Literal:
+        if value in typing.get_args(kind) and not isinstance(value, bool):
+            return value
+    elif isinstance(kind, types.UnionType):
+        members = typing.get_args(kind)
+        if value is None and type(None) in members:
+            return None
+        return _typed(value, next(m for m in members if m is not type(None)), path)
+    elif origin is list:
+        if isinstance(value, list):
+            return [_typed(v, typing.get_args(kind)[0], f"{path}[{i}]") for i, v in enumerate(value)]
+    elif kind is float and isinstance(value, int | float) and not isinstance(value, bool):
+        return float(value)
+    elif kind is str and isinstance(value, int | float) and not isinstance(value, bool):
+        return str(value)  # a file or a clip may be called 7
+    elif isinstance(value, kind) and (kind is bool or not isinstance(value, bool)):
+        return value
+    raise InputError(path, expected=describe(kind), found=f"{value!r}")
+
+
+def describe(kind: object) -> str:
+    """A type in words."""
+    if typing.get_origin(kind) is Literal:
+        return "one of " + ", ".join(str(a) for a in typing.get_args(kind))
+    if isinstance(kind, types.UnionType):
+        return " or ".join("null" if m is type(None) else describe(m) for m in typing.get_args(kind))
+    if typing.get_origin(kind) is list:
+        return f"a list, each entry {describe(typing.get_args(kind)[0])}"
+    return {int: "a whole number", float: "a number", str: "text", bool: "true or false"}[kind]

@@ -1,0 +1,118 @@
+"""Reading our own sources without running them: signatures for the config schema, digests for the cache key."""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+from functools import cache
+from pathlib import Path
+from typing import Literal
+
+from tasks.errors import InputError
+
+ROOT = Path(__file__).resolve().parent.parent
+_TYPES = {"int": int, "float": float, "str": str, "bool": bool, "None": None, "list": list, "Literal": Literal}
+
+
+@cache
+def signature(function: str) -> tuple[tuple[str, ...], dict[str, object]]:
+    """Positional names and keyword-only types of ``"package.module:function"``, read from its source.
+
+    Settings live in the signature of the function that uses them and nowhere else; reading the source instead of
+    importing it keeps torch out of a config error.
+    """
+    module, name = function.split(":")
+    for node in _tree(module).body:
+        if isinstance(node, ast.FunctionDef) and node.name == name:
+            types = {a.arg: _type(a.annotation) for a in node.args.kwonlyargs}
+            return tuple(a.arg for a in node.args.args), types
+    raise LookupError(f"{module} has no function {name}")
+
+
+@cache
+def returns(function: str) -> str:
+    """The return annotation of ``"package.module:function"`` as text."""
+    module, name = function.split(":")
+    for node in _tree(module).body:
+        if isinstance(node, ast.FunctionDef) and node.name == name:
+            return ast.unparse(node.returns) if node.returns else ""
+    raise LookupError(f"{module} has no function {name}")
+
+
+@cache
+def annotations(function: str) -> dict[str, str]:
+    """Positional names -> annotation text."""
+    module, name = function.split(":")
+    node = next(n for n in _tree(module).body if isinstance(n, ast.FunctionDef) and n.name == name)
+    return {a.arg: ast.unparse(a.annotation) if a.annotation else "" for a in node.args.args}
+
+
+@cache
+def digest(module: str) -> str:
+    """Digest of a module of ``tasks`` and of all of ``tasks`` that it imports, comments and docstrings left out."""
+    seen: dict[str, str] = {}
+    pending = [module]
+    while pending:
+        name = pending.pop()
+        if name in seen:
+            continue
+        tree = _tree(name)
+        seen[name] = ast.unparse(_without_docstrings(tree))
+        pending.extend(_imports(tree))
+    text = "\n".join(f"# {name}\n{seen[name]}" for name in sorted(seen))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def has(module: str) -> bool:
+    """Whether a module of ours exists."""
+    return _path(module).is_file()
+
+
+def _path(module: str) -> Path:
+    base = ROOT.joinpath(*module.split("."))
+    return base / "__init__.py" if base.is_dir() else base.with_suffix(".py")
+
+
+@cache
+def _source(module: str) -> str:
+    return _path(module).read_text("utf-8")
+
+
+def _tree(module: str) -> ast.Module:
+    return ast.parse(_source(module))
+
+
+def _type(annotation: ast.expr | None) -> object:
+    """The type an annotation names: int, float, str, bool, list[...], Literal[...] and unions of them with None."""
+    if annotation is None:
+        raise TypeError("a setting without a type")
+    code = compile(ast.Expression(annotation), "<annotation>", "eval")
+    return eval(code, {"__builtins__": {}}, dict(_TYPES))
+
+
+def _imports(tree: ast.Module) -> list[str]:
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found += [a.name for a in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found.append(node.module)
+            found += [f"{node.module}.{a.name}" for a in node.names]
+    return [m for m in found if m.split(".")[0] == "tasks" and has(m)]
+
+
+def _without_docstrings(tree: ast.Module) -> ast.Module:
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        if isinstance(body, list) and body and isinstance(body[0], ast.Expr):
+            constant = body[0].value
+            if isinstance(constant, ast.Constant) and isinstance(constant.value, str):
+                body[0] = ast.Pass()
+    return tree
+
+
+def choices(folder: str, what: str, name: str) -> None:
+    """Raises InputError unless ``tasks/<folder>/<name>.py`` exists."""
+    if not name.isidentifier() or not has(f"tasks.{folder}.{name}"):
+        known = sorted(p.stem for p in (ROOT / "tasks" / folder).glob("*.py") if not p.stem.startswith("_"))
+        raise InputError(what, expected=f"a module of tasks/{folder} ({', '.join(known)})", found=repr(name))

@@ -1,0 +1,157 @@
+"""One stage as a cached Prefect task: a pure function of ``tasks``, its settings and its upstream artefacts.
+
+The cache key is the digest of all that can change the result: stage, function, its source and all of ``tasks`` it
+imports, its own settings, the *content* of its inputs, the major versions of numpy and torch. Not: paths, runner, names
+of cases. A changed stage whose output is the same re-runs nothing after it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import json
+import threading
+import time
+from dataclasses import asdict, dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+
+from flows import source
+from flows.store import Ref, Store, canonical_json, explained
+from tasks.values import Training
+
+FORMAT = 1  # raise it when the store's layout changes
+
+
+@dataclass(frozen=True)
+class Job:
+    """All that a worker needs to run one stage, picklable and small.
+
+    inputs: argument -> (Ref, output name), or for a composite argument a dict of those; files: digest of the input
+    files that the settings name; case: what readers call it.
+    """
+
+    stage: str
+    function: str
+    outputs: tuple[str, ...]
+    settings: dict
+    inputs: dict
+    files: str
+    case: str
+    store: str
+    events: str | None = None
+    extra: dict = field(default_factory=dict)
+
+
+def key_of(job: Job) -> str:
+    """The cache key of a job."""
+    settings = {n: _canonical(v) for n, v in job.settings.items()}
+    if job.files:  # the files' bytes stand for their place; the name is kept, it becomes the subject's
+        settings["path"] = Path(str(job.settings["path"])).name
+    content = {
+        "format": FORMAT,
+        "stage": job.stage,
+        "function": job.function,
+        "source": source.digest(job.function.split(":")[0]),
+        "outputs": job.outputs,
+        "settings": settings,
+        "inputs": _digests(job.inputs),
+        "files": job.files,
+        "versions": {name: version(name).split(".")[0] for name in ("numpy", "torch")},
+    }
+    return hashlib.sha256(canonical_json(content).encode()).hexdigest()[:32]
+
+
+def run(job: Job) -> Ref:
+    """The job's artefact, from the store or computed now. Any process may call it; equal jobs wait for one another."""
+    store, key = Store(job.store), key_of(job)
+    found = store.find(job.stage, key)
+    if found:
+        return found
+    with store.lock(job.stage, key):
+        found = store.find(job.stage, key)
+        if found:
+            return found
+        tell(job, "computing")
+        with Watch() as watch:
+            values = _compute(job, store)
+        meta = {
+            "function": job.function,
+            "settings": job.settings,
+            "case": job.case,
+            "seconds": round(watch.seconds, 3),
+            "peak_mb": round(watch.peak_mb, 1),
+        }
+        return store.put(job.stage, key, values, meta)
+
+
+def tell(job: Job, event: str) -> None:
+    """One line for whoever watches the run; a line of this size is appended whole."""
+    if job.events:
+        line = json.dumps({"event": event, "stage": job.stage, "case": job.case, "time": time.time()})
+        with explained(Path(job.events)), open(job.events, "a", encoding="utf-8") as file:
+            file.write(line + "\n")
+
+
+class Watch:
+    """Seconds and the process's peak memory while a stage runs (other threads' share is in it)."""
+
+    def __enter__(self) -> Watch:
+        import psutil
+
+        self._process = psutil.Process()
+        self._stop = threading.Event()
+        self.peak_mb = self._resident()
+        self._thread = threading.Thread(target=self._sample, daemon=True)
+        self._start = time.perf_counter()
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.seconds = time.perf_counter() - self._start
+        self._stop.set()
+        self._thread.join()
+
+    def _resident(self) -> float:
+        return self._process.memory_info().rss / 2**20
+
+    def _sample(self) -> None:
+        while not self._stop.wait(0.05):
+            self.peak_mb = max(self.peak_mb, self._resident())
+
+
+def _compute(job: Job, store: Store) -> dict[str, object]:
+    module, name = job.function.split(":")
+    function = getattr(importlib.import_module(module), name)
+    kinds = source.annotations(job.function)
+    inputs = {n: _load(store, value, kinds.get(n, "")) for n, value in job.inputs.items()}
+    result = function(**inputs, **job.settings)
+    values = result if isinstance(result, tuple) else (result,)
+    return dict(zip(job.outputs, values, strict=True))
+
+
+def _load(store: Store, value: object, kind: str) -> object:
+    if isinstance(value, dict):
+        parts = {n: _load(store, v, "") for n, v in value.items()}
+        return Training(**parts) if kind == "Training" else parts
+    ref, output = value
+    return store.load(ref, output)
+
+
+def _digests(inputs: object) -> object:
+    if isinstance(inputs, dict):
+        return {n: _digests(v) for n, v in inputs.items()}
+    ref, output = inputs
+    return ref.outputs[output]
+
+
+def _canonical(value: object) -> object:
+    """1 and 1.0 are one setting."""
+    if isinstance(value, float) and value.is_integer():
+        return int(value)
+    return [_canonical(v) for v in value] if isinstance(value, list) else value
+
+
+def ref_to_dict(ref: Ref) -> dict:
+    """A Ref as plain JSON, for Prefect."""
+    return asdict(ref)

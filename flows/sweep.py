@@ -1,0 +1,190 @@
+"""The one Prefect flow: cases become a graph, every node a cached task, finished cases rows of a report."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from flows.config import Case
+from flows.graph import Graph, Node, short
+from flows.pipeline import plan
+from flows.progress import Progress
+from flows.stage import Job, run
+from flows.store import CorruptArtefact, Ref, Store
+from tasks.errors import InputError
+
+ATTEMPTS = 3  # how often damaged artefacts are dropped and computed again before giving up
+
+
+class StageFailed(Exception):
+    """A stage that failed by a defect: its name, the cases that need it, and the original error as the cause."""
+
+
+@dataclass
+class Outcome:
+    """What a run of the graph left: artefacts of the nodes that finished, errors of those that failed themselves."""
+
+    refs: dict[str, Ref] = field(default_factory=dict)
+    errors: dict[str, BaseException] = field(default_factory=dict)
+    computed: set[str] = field(default_factory=set)
+
+
+def run_sweep(cases: list[Case], show: bool = True) -> Path:
+    """Runs all cases in one flow and writes the report; returns its folder.
+
+    Raises InputError for bad data and StageFailed for a defect, after every stage that could run has run: what was
+    finished stays in the store.
+    """
+    config = cases[0].config
+    quiet_prefect()
+    from prefect import flow
+
+    Store(config["store"]["path"])  # a store that cannot be used is said before anything starts
+    graph = Graph()
+    planned = [plan(case, graph) for case in cases]
+
+    @flow(name=config["report"]["name"], task_runner=task_runner(config["runner"]), validate_parameters=False)
+    def sweep(experiment: str, cases: int) -> str:
+        from flows.artifacts import publish
+        from flows.reporting import write
+
+        with Progress(graph, show) as progress:
+            outcome = compute(graph, config, progress)
+            raise_first(graph, outcome)
+            folder, tables = write(planned, graph, outcome.refs, outcome.computed, Store(config["store"]["path"]))
+        publish(folder, tables)
+        if show:
+            progress.finish(tables, folder, len(outcome.computed))
+        return str(folder)
+
+    return Path(sweep(config["report"]["name"], len(cases)))
+
+
+def compute(graph: Graph, config: dict, progress: Progress) -> Outcome:
+    """Brings every node of the graph to the store; damaged artefacts that come to light are computed again."""
+    outcome = Outcome()
+    for _ in range(ATTEMPTS):
+        _pass(graph, config, progress, outcome)
+        damaged = {n: e for n, e in outcome.errors.items() if isinstance(e, CorruptArtefact)}
+        if not damaged:
+            break
+        store = Store(config["store"]["path"])
+        for node, error in damaged.items():
+            store.drop(error.stage, error.key)
+            del outcome.errors[node]
+            progress.note(f"{error}: it is computed again")
+        _forget(graph, outcome, {(e.stage, e.key) for e in damaged.values()})
+    return outcome
+
+
+def _pass(graph: Graph, config: dict, progress: Progress, outcome: Outcome) -> None:
+    """One walk over the graph: a node is submitted when its inputs are there, so no worker waits for another."""
+    from prefect.futures import as_completed
+
+    task = stage_task()
+    waiting = [n for n in graph.nodes.values() if n.id not in outcome.refs and n.id not in outcome.errors]
+    running: dict[object, Node] = {}
+    futures: dict[str, object] = {}
+    with tempfile.TemporaryDirectory(prefix="skelebones-") as folder:
+        events = str(Path(folder) / "events.jsonl")
+        progress.follow(events)
+        while waiting or running:
+            for node in [n for n in waiting if all(u.id in outcome.refs for u in n.upstream())]:
+                waiting.remove(node)
+                job = _job(node, outcome.refs, config["store"]["path"], events)
+                named = task.with_options(name=node.stage, task_run_name=f"{node.stage} · {short(node.cases)}")
+                future = named.submit(job, wait_for=[futures[u.id] for u in node.upstream() if u.id in futures])
+                running[future] = node
+                futures[node.id] = future
+            if not running:
+                return  # what still waits stands behind a failure
+            future = next(iter(as_completed(list(running))))
+            node = running.pop(future)
+            _collect(future, node, outcome, progress)
+
+
+def _collect(future, node: Node, outcome: Outcome, progress: Progress) -> None:
+    result = future.result(raise_on_failure=False)
+    if isinstance(result, dict):
+        ref = Ref(**result)
+        outcome.refs[node.id] = ref
+        if not ref.cached:
+            outcome.computed.add(node.id)
+        progress.done(node, ref)
+    else:
+        outcome.errors[node.id] = result
+        progress.failed(node, result)
+
+
+def stage_task():
+    """The Prefect task that every stage runs in; its final state is named Cached when the store had the result."""
+    from prefect import task
+    from prefect.states import Completed
+
+    from flows.stage import ref_to_dict
+
+    @task(persist_result=False, retries=0)
+    def stage(job: Job):
+        ref = run(job)
+        if ref.cached:
+            return Completed(name="Cached", message="taken from the store", data=ref_to_dict(ref))
+        return ref_to_dict(ref)
+
+    return stage
+
+
+def raise_first(graph: Graph, outcome: Outcome) -> None:
+    """Raises the first error of a stage that failed itself, in the order of the graph."""
+    failed = [n for n in graph.nodes.values() if n.id in outcome.errors]
+    if not failed:
+        return
+    node, error = failed[0], outcome.errors[failed[0].id]
+    if isinstance(error, InputError):
+        raise error
+    more = f" ({len(failed) - 1} more stages failed)" if len(failed) > 1 else ""
+    raise StageFailed(f"stage {node.stage} failed for {short(node.cases)}{more}: {error!r}") from error
+
+
+def task_runner(settings: dict):
+    """Prefect's own task runner of the kind that the config names."""
+    from prefect.task_runners import ProcessPoolTaskRunner, ThreadPoolTaskRunner
+
+    workers = settings["workers"]
+    if workers < 1:
+        raise InputError("runner.workers", expected="at least 1", found=str(workers))
+    kinds = {"threads": ThreadPoolTaskRunner, "processes": ProcessPoolTaskRunner}
+    return kinds[settings["kind"]](max_workers=workers)
+
+
+def quiet_prefect() -> None:
+    """Settings that Prefect reads when it is imported; what the user has set stays."""
+    defaults = {
+        "PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS": "180",  # a slow machine needs more than the usual 20
+        "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
+        "DO_NOT_TRACK": "1",
+        "PREFECT_LOGGING_HANDLERS_CONSOLE_LEVEL": "CRITICAL",  # our own display says what happens
+    }
+    for name, value in defaults.items():
+        os.environ.setdefault(name, value)
+
+
+def _job(node: Node, refs: dict[str, Ref], store: str, events: str) -> Job:
+    def resolve(value):
+        if isinstance(value, dict):
+            return {n: resolve(v) for n, v in value.items()}
+        upstream, output = value
+        return refs[upstream.id], output
+
+    inputs = {n: resolve(v) for n, v in node.inputs.items()}
+    return Job(
+        node.stage, node.function, node.outputs, node.settings, inputs, node.files, short(node.cases), store, events
+    )
+
+
+def _forget(graph: Graph, outcome: Outcome, damaged: set[tuple[str, str]]) -> None:
+    for node in graph.nodes.values():
+        ref = outcome.refs.get(node.id)
+        if ref and (ref.stage, ref.key) in damaged:
+            del outcome.refs[node.id]

@@ -1,0 +1,55 @@
+"""Small stages for the tests of the workflow; they look like those of ``tasks`` to the rest of the system."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+
+from tasks.errors import InputError
+from tasks.values import Metrics
+
+
+def _log(log: str, line: str) -> None:
+    with open(log, "a", encoding="utf-8") as file:
+        file.write(line + "\n")
+
+
+def make(*, value: float, log: str) -> Metrics:
+    """A number."""
+    _log(log, f"make {value}")
+    return Metrics(("x",), ("unit",), np.array([value]))
+
+
+def double(source: Metrics, *, log: str) -> Metrics:
+    """Twice a number."""
+    _log(log, "double")
+    return Metrics(("x",), ("unit",), source.values * 2)
+
+
+def sign(source: Metrics, *, log: str) -> Metrics:
+    """A stage whose output stays the same for many inputs."""
+    _log(log, "sign")
+    return Metrics(("x",), ("unit",), np.sign(source.values))
+
+
+def slow(source: Metrics, *, seconds: float, log: str) -> Metrics:
+    """Takes a while, and says when it began."""
+    _log(log, f"slow began {os.getpid()}")
+    time.sleep(seconds)
+    _log(log, "slow ended")
+    return source
+
+
+def defect(source: Metrics, *, log: str) -> Metrics:
+    """A stage with a defect of ours."""
+    _log(log, "defect")
+    raise ZeroDivisionError("a defect in the stage")
+
+
+def refuse(source: Metrics, *, path: str, log: str) -> Metrics:
+    """A stage that finds its input bad."""
+    _log(log, "refuse")
+    raise InputError(str(Path(path).name), expected="something good", found="something bad", do="mend it")

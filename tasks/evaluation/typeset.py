@@ -146,33 +146,32 @@ def html(table: Table) -> str:
     return _HTML.render(table=table, groups=groups, show=show, data_text=data_text, footnotes=footnotes, legend=LEGEND)
 
 
-def terminal(table: Table, *, columns: int = 5) -> rich.console.Group:
-    """The table for the terminal, cut between subjects into grids of at most so many columns (a subject is never cut).
-    The best is bold and green, the second best underlined; a grid leaves out rows that say nothing in it."""
+def terminal(table: Table) -> rich.console.Group:
+    """The table for the terminal: one grid a subject, and one for what is only printed in the paper. The best is bold
+    and green, the second best underlined; a grid leaves out rows that say nothing in it."""
     from rich.console import Group
     from rich.text import Text
 
     footnotes = table.footnotes
     notes = [*table.notes, *(f"[{i}] {note}." for i, note in enumerate(footnotes, start=1)), LEGEND]
-    grids: list[list[Column]] = [[]]
-    for _, group in groupby(table.columns, key=lambda c: c.group):
-        members = list(group)
-        if grids[-1] and len(grids[-1]) + len(members) > columns:
-            grids.append([])
-        grids[-1] += members
-    shown = [_grid(table.rows, members, footnotes) for members in grids]
+    measured = {column.group for column in table.columns if column.kind == "ours"}
+    grids: dict[str, list[Column]] = {}
+    for column in table.columns:
+        grids.setdefault(column.group if column.group in measured else "printed in the paper, not run", []).append(
+            column
+        )
+    shown = [_grid(title, table.rows, columns, footnotes) for title, columns in grids.items()]
     return Group(Text(table.title, "bold"), *shown, Text("\n".join(notes), "dim"))
 
 
-def _grid(rows: tuple[str, ...], columns: list[Column], footnotes: list[str]) -> rich.table.Table:
+def _grid(title: str, rows: tuple[str, ...], columns: list[Column], footnotes: list[str]) -> rich.table.Table:
     from rich.table import Table as Grid
     from rich.text import Text
 
-    groups = list(dict.fromkeys(column.group for column in columns))
-    grid = Grid(title=Text(groups[0], "italic") if len(groups) == 1 else None)
+    grid = Grid(title=Text(title, "italic"), title_justify="left")
     grid.add_column("method", no_wrap=True)
     for column in columns:
-        heading = [column.group] if len(groups) > 1 else []
+        heading = [column.group] if column.group != title else []
         grid.add_column(Text("\n".join([*heading, column.label, data_text(column)])), justify="right")
     for r, label in enumerate(rows):
         cells = [column.cells[r] for column in columns]
@@ -181,6 +180,7 @@ def _grid(rows: tuple[str, ...], columns: list[Column], footnotes: list[str]) ->
         line = [Text(label)]
         for column, cell in zip(columns, cells, strict=True):
             main, rest = cell_text(column, cell)
+            rest = rest.replace("\u00a0", "")  # rich breaks lines at it
             mark = f" [{footnotes.index(cell.note) + 1}]" if cell.note else ""
             line.append(Text(main, {1: "bold green", 2: "underline"}.get(cell.rank, "")).append(rest + mark, "dim"))
         grid.add_row(*line)

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from flows.config import Case
 from flows.graph import Graph, Node, short
-from flows.pipeline import plan
+from flows.pipeline import Planned, plan
 from flows.progress import Progress
+from flows.server import server
 from flows.stage import Job, run
 from flows.store import CorruptArtefact, Ref, Store
 from tasks.errors import InputError
@@ -38,12 +38,16 @@ def run_sweep(cases: list[Case], show: bool = True) -> Path:
     finished stays in the store.
     """
     config = cases[0].config
-    quiet_prefect()
-    from prefect import flow
-
     Store(config["store"]["path"])  # a store that cannot be used is said before anything starts
     graph = Graph()
     planned = [plan(case, graph) for case in cases]
+    with server():
+        return Path(_flow(config, graph, planned, show)(config["report"]["name"], len(cases)))
+
+
+def _flow(config: dict, graph: Graph, planned: list[Planned], show: bool):
+    """The flow of a sweep; its parameters are what the run's page shows."""
+    from prefect import flow
 
     @flow(name=config["report"]["name"], task_runner=task_runner(config["runner"]), validate_parameters=False)
     def sweep(experiment: str, cases: int) -> str:
@@ -59,7 +63,7 @@ def run_sweep(cases: list[Case], show: bool = True) -> Path:
             progress.finish(tables, folder, len(outcome.computed))
         return str(folder)
 
-    return Path(sweep(config["report"]["name"], len(cases)))
+    return sweep
 
 
 def compute(graph: Graph, config: dict, progress: Progress) -> Outcome:
@@ -156,18 +160,6 @@ def task_runner(settings: dict):
         raise InputError("runner.workers", expected="at least 1", found=str(workers))
     kinds = {"threads": ThreadPoolTaskRunner, "processes": ProcessPoolTaskRunner}
     return kinds[settings["kind"]](max_workers=workers)
-
-
-def quiet_prefect() -> None:
-    """Settings that Prefect reads when it is imported; what the user has set stays."""
-    defaults = {
-        "PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS": "180",  # a slow machine needs more than the usual 20
-        "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
-        "DO_NOT_TRACK": "1",
-        "PREFECT_LOGGING_HANDLERS_CONSOLE_LEVEL": "CRITICAL",  # our own display says what happens
-    }
-    for name, value in defaults.items():
-        os.environ.setdefault(name, value)
 
 
 def _job(node: Node, refs: dict[str, Ref], store: str, events: str) -> Job:

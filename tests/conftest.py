@@ -23,13 +23,10 @@ def shared_data() -> Path:
 
 
 @pytest.fixture(scope="session")
-def prefect_server(tmp_path_factory):
-    """One Prefect server for the whole test run, with a database of its own."""
-    from flows.sweep import quiet_prefect
+def prefect_server():
+    """One Prefect server for the whole test run."""
+    from flows.server import server
 
-    quiet_prefect()
-    os.environ["PREFECT_HOME"] = str(tmp_path_factory.mktemp("prefect"))
-    from prefect.testing.utilities import prefect_test_harness
-
-    with prefect_test_harness(server_startup_timeout=180):
-        yield
+    os.environ.pop("PREFECT_API_URL", None)  # never the user's
+    with server() as url:
+        yield url

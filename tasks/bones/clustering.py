@@ -1,0 +1,190 @@
+"""Rigid motion clusters by splitting and reassignment (LBG-VQ; Le & Deng 2014, section 4).
+
+Points whose paths one rigid motion explains belong together. Clusters are split at badly explained points far from
+the cluster's middle until the ceiling is reached, then merged back one pair at a time: that gives the error against
+the count of clusters in one go, from which the count is chosen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from tasks.bones import transforms, weights
+from tasks.bones.refit import rigid_transforms
+from tasks.bones.trajectories import Trajectories, compress
+from tasks.errors import InputError
+from tasks.geometry.measure import diagonal
+from tasks.values import Canonical, Clusters, Motion
+
+_SAMPLE = 2000  # points clustered; all points are then assigned to the clusters found
+_COMPRESSION = 2e-3  # error allowed to the compressed paths, relative to the shape's extent: clusters are far coarser
+_SEED_POINTS = 12  # points a new cluster starts from
+_LEAST = 3  # points below which a cluster has no rigid motion of its own
+_POLISH = 8  # reassignments once the count is chosen
+_MOST_SPLITS = 60  # rounds of splitting, where clusters keep falling empty
+_CONSIDERABLE = 0.01  # part of the mean cluster's error below which a cluster is not split
+
+
+def cluster(
+    train: Motion,
+    canonical: Canonical,
+    *,
+    max_bones: int,
+    count: Literal["auto", "fixed"],
+    slack: float,
+    exact: float,
+    rounds: int,
+    seed: int,
+) -> Clusters:
+    """Rigid motion clusters of points.
+
+    max_bones: ceiling; count: "fixed" takes as many as the points allow, "auto" the smallest count whose error is
+    below `exact` (fraction of the canonical diagonal) or within `slack` (relative) of the error at the ceiling;
+    rounds: reassignments after every split. Raises InputError for settings out of range.
+    """
+    if max_bones < 1:
+        raise InputError("bones.max_bones", expected="at least 1", found=str(max_bones))
+    rng = np.random.default_rng(seed)
+    total = len(canonical.points)
+    sample = np.sort(rng.choice(total, min(total, _SAMPLE), replace=False))
+    extent = diagonal(canonical.points[sample])
+    paths = compress(train.points, canonical.points, tolerance=_COMPRESSION * extent, sample=sample)
+    part = replace(paths, rest=paths.rest[sample], path=paths.path[sample])
+    part = replace(part, energy=_energy(part))
+    floor = exact * extent
+    labels = _split(part, max(min(max_bones, len(sample) // _LEAST), 1), rounds, floor)
+    counts, errors, states = _merge_down(part, labels)
+    if count == "auto":
+        chosen = choose_count(counts, errors, len(sample), slack, floor)
+        labels = _reassign(part, states[chosen], _POLISH)
+    found = _all_points(paths, part, labels)
+    return Clusters(found, rigid_transforms(train.points, canonical.points, found), counts, errors)
+
+
+def choose_count(counts: np.ndarray, errors: np.ndarray, points: int, slack: float, floor: float) -> int:
+    """Position of the smallest count that explains the motion as well as the largest one, but for `slack`.
+
+    Every cluster has six numbers to fit a frame of three for each point, so many clusters fit noise: errors are
+    compared per degree of freedom left. An error below `floor` is good enough by itself.
+    """
+    free = np.maximum(1.0 - 2.0 * counts / points, 0.05)
+    fair = errors / np.sqrt(free)
+    good = (fair <= (1.0 + slack) * fair[-1]) | (errors <= floor)
+    return int(np.argmax(good))
+
+
+def _energy(paths: Trajectories) -> float:
+    return float(np.sum(paths.path.astype(np.float64) ** 2))
+
+
+def _fit(part: Trajectories, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Sums K (B, 4, 4) and Y (B, 4, 3, F) of each cluster and its best rigid offsets (B, 4, 3, F)."""
+    k, y = transforms.sums(part, labels[:, None], np.ones((len(labels), 1)), int(labels.max()) + 1)
+    k = k[np.arange(len(k)), np.arange(len(k))]
+    return k, y, transforms.rigid_fit(k, y)[0]
+
+
+def _split(part: Trajectories, ceiling: int, rounds: int, floor: float) -> np.ndarray:
+    """Labels of at most `ceiling` clusters: all clusters with a considerable error are split in each round."""
+    labels = np.zeros(len(part.rest), np.int32)
+    near = (
+        cKDTree(part.rest[:, :3]).query(part.rest[:, :3], k=min(_SEED_POINTS, len(labels)))[1].reshape(len(labels), -1)
+    )
+    for _ in range(_MOST_SPLITS):
+        bones = weights.forms(part, _fit(part, labels)[2])
+        found, error = weights.nearest_bone(part, bones)
+        count = int(labels.max()) + 1
+        reached = part.alignment.scale * np.sqrt(error.mean())
+        if count >= ceiling or reached <= floor:
+            break
+        labels = _compact(found)
+        seeds = _seeds(part, labels, error, near, ceiling - int(labels.max()) - 1)
+        for new, seed in enumerate(seeds, start=int(labels.max()) + 1):
+            members = near[seed]
+            labels[members[labels[members] == labels[seed]]] = new
+        labels = _reassign(part, _compact(labels), rounds)
+    return labels
+
+
+def _seeds(part: Trajectories, labels: np.ndarray, error: np.ndarray, near: np.ndarray, room: int) -> list[int]:
+    """The points at which clusters are split, worst cluster first: those of greatest (e - e_min)(d - d_min).
+
+    e is the median error around the point, so that a stray point does not get a cluster of its own.
+    """
+    calm = np.median(error[near], axis=1)
+    total = np.bincount(labels, error)
+    order = [c for c in np.argsort(-total, kind="stable") if total[c] > _CONSIDERABLE * total.mean()]
+    seeds = []
+    for c in order[:room]:
+        members = np.nonzero(labels == c)[0]
+        place = part.rest[members, :3]
+        distance = np.linalg.norm(place - place.mean(0), axis=1)
+        worth = (calm[members] - calm[members].min()) * (distance - distance.min())
+        seeds.append(int(members[np.argmax(worth)]))
+    return seeds
+
+
+def _reassign(part: Trajectories, labels: np.ndarray, rounds: int) -> np.ndarray:
+    """Rounds of fitting rigid motions and giving each point to the one that explains it best."""
+    for _ in range(rounds):
+        bones = weights.forms(part, _fit(part, labels)[2])
+        found = weights.nearest_bone(part, bones)[0]
+        small = np.bincount(found, minlength=int(labels.max()) + 1) < _LEAST
+        if small[found].any() and not small.all():
+            kept = np.nonzero(~small)[0]
+            found = weights.nearest_bone(part, weights.forms(part, _fit(part, labels)[2][kept]))[0]
+        labels = _compact(found)
+    return labels
+
+
+def _compact(labels: np.ndarray) -> np.ndarray:
+    """The same clusters numbered without gaps."""
+    return np.unique(labels, return_inverse=True)[1].reshape(-1).astype(np.int32)
+
+
+def _merge_down(part: Trajectories, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+    """Merges the two clusters that cost least, again and again.
+
+    Returns counts rising from one, the vertex RMSE at each and the labels at each. Sums of clusters just add, so a
+    merger needs no look at the points.
+    """
+    k, y, _ = _fit(part, labels)
+    gain = transforms.rigid_fit(k, y)[1]
+    alive = np.ones(len(k), bool)
+    cost = np.full((len(k), len(k)), np.inf)
+    for b in range(len(k) - 1):
+        _pair_costs(k, y, gain, b, np.arange(b + 1, len(k)), cost)
+    energy, current = _energy(part), labels.copy()
+    states, errors = [current.copy()], [part.rmse(energy + gain.sum())]
+    for _ in range(len(k) - 1):
+        a, b = np.unravel_index(np.argmin(cost), cost.shape)
+        k[a] += k[b]
+        y[a] += y[b]
+        gain[a] += gain[b] + cost[a, b]
+        alive[b] = False
+        cost[b], cost[:, b] = np.inf, np.inf
+        others = np.nonzero(alive)[0]
+        _pair_costs(k, y, gain, int(a), others[others != a], cost)
+        current[current == b] = a
+        states.append(current.copy())
+        errors.append(part.rmse(energy + gain[alive].sum()))
+    counts = np.arange(1, len(states) + 1)
+    return counts, np.array(errors[::-1]), [_compact(s) for s in states[::-1]]
+
+
+def _pair_costs(k: np.ndarray, y: np.ndarray, gain: np.ndarray, a: int, others: np.ndarray, cost: np.ndarray) -> None:
+    """cost[i, j], i < j: what merging adds to the squared error; filled for the pairs of a with others."""
+    if len(others) == 0:
+        return
+    together = transforms.rigid_fit(k[a] + k[others], y[a] + y[others])[1]
+    cost[np.minimum(a, others), np.maximum(a, others)] = together - gain[a] - gain[others]
+
+
+def _all_points(paths: Trajectories, part: Trajectories, labels: np.ndarray) -> np.ndarray:
+    """Labels of all points, (N,) int32, by the clusters of the sample; none is empty."""
+    found = weights.nearest_bone(paths, weights.forms(paths, _fit(part, labels)[2]))[0]
+    return _compact(found)

@@ -1,0 +1,50 @@
+"""Which points are neighbours that move together, for smoothing over the surface."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tasks.geometry import neighbours
+
+_NEAREST = 8
+_FRAMES = 24  # frames by which an edge is judged
+_RIGID = 0.05  # change of length, relative to the length at rest, at which an edge counts half
+
+
+def moving_together(
+    points: np.ndarray, canonical: np.ndarray, faces: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Neighbours over mesh edges, or over the nearest points where there are no faces.
+
+    An edge counts the less the more its length changes over the frames, so that parts that only touch at rest are not
+    tied together. points: (F, N, 3); canonical: (N, 3); faces: (T, 3) or None
+    -> (indptr (N + 1,), indices, shares): point n's neighbours and their shares, which sum to one or there are none.
+    """
+    count = len(canonical)
+    edges = neighbours.nearest_edges(canonical, _NEAREST) if faces is None else neighbours.mesh_edges(faces)
+    a, b = edges[:, 0], edges[:, 1]
+    rest = _lengths(canonical, a, b)
+    change = np.zeros(len(edges))
+    chosen = np.unique(np.linspace(0, len(points) - 1, _FRAMES).round().astype(int))
+    for f in chosen:
+        change += (_lengths(points[f], a, b) - rest) ** 2
+    stretch = np.sqrt(change / len(chosen)) / np.maximum(rest, 1e-3 * rest.mean() if len(rest) else 1.0)
+    strength = 1.0 / (1.0 + (stretch / _RIGID) ** 2)
+    rows, columns = np.concatenate([a, b]), np.concatenate([b, a])
+    order = np.lexsort((columns, rows))
+    rows, columns, strength = rows[order], columns[order], np.concatenate([strength, strength])[order]
+    indptr = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=count))]).astype(np.int64)
+    shares = strength / np.maximum(np.bincount(rows, strength, minlength=count), 1e-300)[rows]
+    return indptr, columns.astype(np.int64), shares
+
+
+def average(graph: tuple[np.ndarray, np.ndarray, np.ndarray], values: np.ndarray) -> np.ndarray:
+    """Half each point's value (N,), half its neighbours' mean."""
+    indptr, indices, shares = graph
+    rows = np.repeat(np.arange(len(values)), np.diff(indptr))
+    mean = np.bincount(rows, shares * values[indices], minlength=len(values))
+    return np.where(np.diff(indptr) > 0, 0.5 * (values + mean), values)
+
+
+def _lengths(points: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(points[a].astype(np.float64) - points[b], axis=1)

@@ -1,0 +1,379 @@
+"""Skin weights of given bones, point by point (Le & Deng 2012, section 4.1), by exchange of bones.
+
+With sum w = 1 the error of a point is a quadratic form of its weights alone,
+
+    |sum_b w_b D_b h - u|^2 = w^T Q w,   Q_bc = h^T D_b^T D_c h - c_b - c_c + |u|^2,   c_b = <D_b h, u>,
+
+whose parts D_b^T D_c are sums over frames taken once for all points. Of the bones outside the support the one that
+lowers w^T Q w most along the line towards it comes in; of five the least useful goes out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from tasks.bones.products import FAST, product
+from tasks.bones.trajectories import Trajectories
+from tasks.geometry.parallel import for_chunks
+
+_POINTS = 512  # points a thread takes at a time
+_TILE = 8  # points whose correlations with all bones are computed together
+_RIDGE = 1e-9  # relative to the mean diagonal: keeps the solve of two bones that move alike from dividing by zero
+_GAIN = 1e-4  # relative gain below which an exchange is not worth its solve
+
+
+@dataclass(frozen=True)
+class Forms:
+    """What the bones contribute to Q, for all points. linear: (P, 4 B), <D_b h, u> = sum_ip h_i linear[p, i B + b]
+    path_p; square: (B, 10, B), h^T D_b^T D_c h = sum_k square[b, k, c] (h h^T)_k, upper triangle row by row."""
+
+    linear: np.ndarray
+    square: np.ndarray
+
+
+def forms(paths: Trajectories, offsets: np.ndarray) -> Forms:
+    """offsets: (B, 4, 3, F). Errors are means over frames from here on."""
+    count = len(offsets)
+    rows = offsets.reshape(count * 4, -1)
+    linear = product(rows, paths.basis).reshape(count, 4, -1).transpose(2, 1, 0) / paths.frames
+    gram = product(rows, rows.T).reshape(count, 4, count, 4) / paths.frames
+    square = np.empty((count, 10, count))
+    pairs = [(i, j) for i in range(4) for j in range(i, 4)]
+    for k, (i, j) in enumerate(pairs):
+        square[:, k] = gram[:, i, :, j] if i == j else gram[:, i, :, j] + gram[:, j, :, i]
+    return Forms(np.ascontiguousarray(linear).reshape(linear.shape[0], -1), square)
+
+
+def nearest_bone(paths: Trajectories, bones: Forms) -> tuple[np.ndarray, np.ndarray]:
+    """The one bone that explains each point best: (N,) int32, and its squared error, (N,) mean over frames."""
+    label, error = np.empty(len(paths.rest), np.int32), np.empty(len(paths.rest))
+
+    def work(start: int, stop: int) -> None:
+        _nearest_bone(paths.rest, paths.path, paths.frames, bones.linear, bones.square, label, error, start, stop)
+
+    for_chunks(work, len(label), _POINTS)
+    return label, error
+
+
+def exchange(
+    paths: Trajectories,
+    bones: Forms,
+    index: np.ndarray,
+    value: np.ndarray,
+    *,
+    rounds: int,
+    smoothness: float,
+    graph: tuple[np.ndarray, np.ndarray, np.ndarray],
+) -> np.ndarray:
+    """Improves sparse weights in place; returns each point's squared error, (N,) mean over frames.
+
+    index: (N, S) int32, -1 for an empty place; value: (N, S) float64; rounds: exchanges tried, 0 keeps the support;
+    smoothness: weight of |w - mean of the neighbours' w|^2; graph: neighbours as (indptr, indices, shares).
+    """
+    error = np.empty(len(index))
+    last = (index.copy(), value.copy())
+
+    def work(start: int, stop: int) -> None:
+        _exchange(
+            paths.rest,
+            paths.path,
+            paths.frames,
+            bones.linear,
+            bones.square,
+            index,
+            value,
+            error,
+            rounds,
+            smoothness,
+            graph,
+            last,
+            start,
+            stop,
+        )
+
+    for_chunks(work, len(index), _POINTS)
+    return error
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _correlate(rest, path, frames, linear, low, high, raw, correlation, energy):
+    """correlation[n, b] = <D_b h_n, u_n> and energy[n] = |u_n|^2, means over frames, for the points low..high."""
+    columns = linear.shape[1]
+    count = columns // 4
+    width = path.shape[1]
+    whole = width - width % 4
+    for n in range(low, high):
+        row = raw[n - low]
+        row[:] = 0.0
+        total = 0.0
+        for p in range(0, whole, 4):
+            a0, a1 = np.float64(path[n, p]), np.float64(path[n, p + 1])
+            a2, a3 = np.float64(path[n, p + 2]), np.float64(path[n, p + 3])
+            total += a0 * a0 + a1 * a1 + a2 * a2 + a3 * a3
+            for j in range(columns):
+                row[j] += a0 * linear[p, j] + a1 * linear[p + 1, j] + a2 * linear[p + 2, j] + a3 * linear[p + 3, j]
+        for p in range(whole, width):
+            a0 = np.float64(path[n, p])
+            total += a0 * a0
+            for j in range(columns):
+                row[j] += a0 * linear[p, j]
+        energy[n - low] = total / frames
+        h0, h1, h2 = rest[n, 0], rest[n, 1], rest[n, 2]
+        for b in range(count):
+            correlation[n - low, b] = h0 * row[b] + h1 * row[count + b] + h2 * row[2 * count + b] + row[3 * count + b]
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _products_of(h, out):
+    """The ten different entries of h h^T."""
+    k = 0
+    for i in range(4):
+        for j in range(i, 4):
+            out[k] = h[i] * h[j]
+            k += 1
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _nearest_bone(rest, path, frames, linear, square, label, error, start, stop):
+    count = len(square)
+    raw, correlation = np.empty((_TILE, 4 * count)), np.empty((_TILE, count))
+    energy, hh = np.empty(_TILE), np.empty(10)
+    for low in range(start, stop, _TILE):
+        high = min(low + _TILE, stop)
+        _correlate(rest, path, frames, linear, low, high, raw, correlation, energy)
+        for n in range(low, high):
+            _products_of(rest[n], hh)
+            best, least = 0, np.inf
+            for b in range(count):
+                total = energy[n - low] - 2.0 * correlation[n - low, b]
+                for k in range(10):
+                    total += hh[k] * square[b, k, b]
+                if total < least:
+                    best, least = b, total
+            label[n], error[n] = best, max(least, 0.0)
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _exchange(rest, path, frames, linear, square, index, value, error, rounds, smoothness, graph, last, start, stop):
+    count, slots = len(square), index.shape[1]
+    raw, correlation = np.empty((_TILE, 4 * count)), np.empty((_TILE, count))
+    energy, hh = np.empty(_TILE), np.empty(10)
+    diagonal, reach = np.empty((10, count)), np.empty(count)
+    for b in range(count):
+        for k in range(10):
+            diagonal[k, b] = square[b, k, b]
+    bones, w = np.empty(slots + 1, np.int64), np.empty(slots + 1)
+    q = np.empty((slots + 1, slots + 1))
+    for low in range(start, stop, _TILE):
+        high = min(low + _TILE, stop)
+        _correlate(rest, path, frames, linear, low, high, raw, correlation, energy)
+        for n in range(low, high):
+            c, e = correlation[n - low], energy[n - low]
+            _products_of(rest[n], hh)
+            if smoothness > 0.0:
+                _pull(n, graph, last, smoothness, c)
+            size = 0
+            for s in range(slots):
+                if index[n, s] >= 0:
+                    bones[size], w[size] = index[n, s], value[n, s]
+                    size += 1
+            _form(square, hh, c, e, smoothness, bones, size, q)
+            size = _solve(q, bones, w, size)
+            now = _value(q, w, size)
+            for _ in range(rounds):
+                found = _best_bone(square, diagonal, hh, c, e, smoothness, bones, w, size, now, reach)
+                if found < 0:
+                    break
+                before = now
+                size, now = _bring_in(square, hh, c, e, smoothness, bones, w, size, slots, now, q, found)
+                if now >= before:
+                    break
+            error[n] = max(now, 0.0)
+            for s in range(slots):
+                index[n, s], value[n, s] = (bones[s], w[s]) if s < size else (-1, 0.0)
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _pull(n, graph, last, smoothness, c):
+    """|w - m|^2 = |w|^2 - 2 <w, m> + ...: since sum w = 1 the mean m of the neighbours just adds to c."""
+    indptr, indices, shares = graph
+    old_index, old_value = last
+    for a in range(indptr[n], indptr[n + 1]):
+        other = indices[a]
+        for s in range(old_index.shape[1]):
+            if old_index[other, s] >= 0:
+                c[old_index[other, s]] += smoothness * shares[a] * old_value[other, s]
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _form(square, hh, c, e, smoothness, bones, size, q):
+    """q[:size, :size] = Q among the given bones."""
+    for s in range(size):
+        for r in range(s, size):
+            total = e - c[bones[s]] - c[bones[r]]
+            for k in range(10):
+                total += hh[k] * square[bones[s], k, bones[r]]
+            q[s, r] = q[r, s] = total + (smoothness if s == r else 0.0)
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _value(q, w, size):
+    total = 0.0
+    for s in range(size):
+        for r in range(size):
+            total += w[s] * w[r] * q[s, r]
+    return total
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _best_bone(square, diagonal, hh, c, e, smoothness, bones, w, size, now, reach):
+    """The bone outside the support towards which w^T Q w falls most along a line, or -1."""
+    count = len(square)
+    shift = e
+    for b in range(count):
+        reach[b] = 0.0
+    for s in range(size):
+        shift -= w[s] * c[bones[s]]
+        for k in range(0, 10, 2):
+            f0, f1 = w[s] * hh[k], w[s] * hh[k + 1]
+            row0, row1 = square[bones[s], k], square[bones[s], k + 1]
+            for b in range(count):
+                reach[b] += f0 * row0[b] + f1 * row1[b]
+    best, most = -1, _GAIN * now
+    for b in range(count):
+        along = reach[b] + shift - c[b]  # <r, d_b>
+        if along >= now:
+            continue
+        own = e - 2.0 * c[b] + smoothness
+        for k in range(10):
+            own += hh[k] * diagonal[k, b]
+        gap = now - along
+        gain = gap * gap / max(now - 2.0 * along + own, gap)  # the step stops at w_b = 1
+        if gain > most:
+            inside = False
+            for s in range(size):
+                inside = inside or bones[s] == b
+            if not inside:
+                best, most = b, gain
+    return best
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _bring_in(square, hh, c, e, smoothness, bones, w, size, slots, now, q, found):
+    """Adds a bone, solves, and if the support is too large drops the bone that costs least.
+
+    The support and weights are left as they were where that brings nothing. Returns size and value.
+    """
+    old_bones, old_w = bones.copy(), w.copy()
+    bones[size], w[size] = found, 0.0
+    _form(square, hh, c, e, smoothness, bones, size + 1, q)
+    new_size = _solve(q, bones, w, size + 1)
+    if new_size <= slots:
+        value = _value(q, w, new_size)
+        if value < now:
+            return new_size, value
+        bones[:], w[:] = old_bones, old_w
+        return size, now
+    full_q, full_bones, full_w = q.copy(), bones.copy(), w.copy()
+    best_size, best, best_bones, best_w = size, now, old_bones, old_w
+    for out in range(new_size):
+        rest = 1.0 - full_w[out]
+        if rest <= 0.0:
+            continue
+        left = 0
+        for s in range(new_size):
+            if s == out:
+                continue
+            bones[left], w[left] = full_bones[s], full_w[s] / rest
+            column = 0
+            for r in range(new_size):
+                if r != out:
+                    q[left, column] = full_q[s, r]
+                    column += 1
+            left += 1
+        left = _solve(q, bones, w, left)
+        value = _value(q, w, left)
+        if value < best:
+            best_size, best, best_bones, best_w = left, value, bones.copy(), w.copy()
+    bones[:], w[:] = best_bones, best_w
+    return best_size, best
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _solve(q, bones, w, size):
+    """Minimises w^T Q w over the simplex from a feasible w, dropping bones whose weight reaches zero.
+
+    q, bones and w are packed to the bones that stay. Returns their number.
+    """
+    goal, matrix = np.empty(size), np.empty((size, size))
+    while size > 1:
+        top = 0
+        for s in range(1, size):
+            if w[s] > w[top]:
+                top = s
+        _swap(q, bones, w, 0, top, size)
+        _interior(q, goal, matrix, size)
+        step, stop = 1.0, -1
+        for s in range(size):
+            if goal[s] <= 0.0 and w[s] <= step * (w[s] - goal[s]):
+                step, stop = w[s] / (w[s] - goal[s]) if w[s] > goal[s] else 0.0, s
+        for s in range(size):
+            w[s] += step * (goal[s] - w[s])
+        if stop < 0:
+            break
+        _swap(q, bones, w, stop, size - 1, size)
+        size -= 1
+    total = 0.0
+    for s in range(size):
+        w[s] = max(w[s], 0.0)
+        total += w[s]
+    for s in range(size):
+        w[s] /= total
+    return size
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _interior(q, goal, matrix, size):
+    """goal[:size] minimises w^T Q w with sum w = 1 only: Cholesky on differences from bone 0, the heaviest."""
+    n = size - 1
+    trace = 0.0
+    for s in range(n):
+        for r in range(n):
+            matrix[s, r] = q[s + 1, r + 1] - q[s + 1, 0] - q[0, r + 1] + q[0, 0]
+        goal[s + 1] = q[0, 0] - q[s + 1, 0]
+        trace += matrix[s, s]
+    ridge = _RIDGE * trace / n + 1e-300
+    for s in range(n):
+        matrix[s, s] += ridge
+    for s in range(n):
+        for r in range(s + 1):
+            total = matrix[s, r]
+            for k in range(r):
+                total -= matrix[s, k] * matrix[r, k]
+            matrix[s, r] = np.sqrt(max(total, ridge)) if s == r else total / matrix[r, r]
+    for s in range(n):
+        for k in range(s):
+            goal[s + 1] -= matrix[s, k] * goal[k + 1]
+        goal[s + 1] /= matrix[s, s]
+    for s in range(n - 1, -1, -1):
+        for k in range(s + 1, n):
+            goal[s + 1] -= matrix[k, s] * goal[k + 1]
+        goal[s + 1] /= matrix[s, s]
+    goal[0] = 1.0
+    for s in range(n):
+        goal[0] -= goal[s + 1]
+
+
+@njit(cache=True, nogil=True)
+def _swap(q, bones, w, a, b, size):
+    if a == b:
+        return
+    bones[a], bones[b] = bones[b], bones[a]
+    w[a], w[b] = w[b], w[a]
+    for s in range(size):
+        q[a, s], q[b, s] = q[b, s], q[a, s]
+    for s in range(size):
+        q[s, a], q[s, b] = q[s, b], q[s, a]

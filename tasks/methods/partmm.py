@@ -1,0 +1,53 @@
+"""PartMM, and FullMM where there is one part: motion matching, the paper's method."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from tasks.geometry.skinning import skin
+from tasks.motion.matching import match
+from tasks.values import Animation, Poses, Training
+
+
+def animate(
+    training: Training,
+    query: Poses,
+    *,
+    k: int,
+    patch: int,
+    levels: int,
+    lambda_: float,
+    temperature: float,
+    represent: Literal["root", "part", "residual"],
+    align: bool,
+    dynamics: float,
+) -> Animation:
+    """Poses -> points by partwise motion matching (GaussiAnimate 3.3, eq. 7-10 and alg. 1), then skinning by W.
+
+    k: windows blended for each part; patch: frames of a window (p); levels: most pyramid levels, of which as many are
+    used as let every frame lie in a window, min(levels, 1 + floor(log2(F / p))); lambda_: weight of a finer level.
+    temperature: of the softmax over windows, in units of the best window's distance.
+    represent: what bones are stored relative to: the model's ``root`` (the paper), the ``part``'s root joint, or as a
+    ``residual`` on what skinning of the skeleton predicts for them.
+    align: turn matched bones to the query's joints by eq. 9, about the part's root joint (``root`` and ``part``).
+    dynamics: weight of gravity, velocity, acceleration and angular velocity of the root in the key; 0 is the paper's.
+
+    Clips of the query shorter than a patch are padded with their last pose. Raises InputError for poses of another
+    skeleton, matrices that are no rotations, training clips all shorter than a patch and numbers out of range.
+    """
+    found = match(
+        training,
+        query,
+        k=k,
+        patch=patch,
+        levels=levels,
+        lambda_=lambda_,
+        temperature=temperature,
+        represent=represent,
+        align=align,
+        dynamics=dynamics,
+    )
+    points = skin(training.skinning.rest, training.skinning.weights, found.bones)
+    return Animation(
+        points=points, bones=found.bones, sources=found.sources, distance=found.distance, parts=training.parts.names
+    )

@@ -1,0 +1,84 @@
+"""Blend weights, the alignment rotation and dynamics, each against its definition."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tasks.geometry import rigid
+from tasks.geometry.rotations import from_quaternion, from_rotation_vector, project_so3, to_quaternion
+from tasks.motion.blending import PartMotion, Sources, _mean_turn, blend, level_shares, window_weights
+from tasks.motion.dynamics import root_dynamics
+from tasks.motion.frames import centroids, from_frames, to_frames
+
+
+def test_level_shares_follow_the_recursion():
+    value, matched = None, np.array([5.0, -2.0, 3.0, 7.0])
+    for x in matched:
+        value = x if value is None else (1 - 0.7) * value + 0.7 * x
+    assert np.isclose(level_shares(4, 0.7) @ matched, value)
+    assert np.isclose(level_shares(5, 0.7).sum(), 1)
+
+
+def test_window_weights_collapse_on_an_exact_match_and_ignore_missing_windows():
+    exact = window_weights(np.array([0.0, 0.01, 0.2]), 1.0)
+    np.testing.assert_allclose(exact, [1, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(window_weights(np.array([0.3, 0.3, np.inf]), 1.0), [0.5, 0.5, 0])
+    assert np.all(window_weights(np.full(3, np.inf), 1.0) == 0)
+
+
+def test_mean_turn_is_the_projected_sum_of_rotations():
+    rng = np.random.default_rng(0)
+    turn = from_rotation_vector(rng.normal(size=3))
+    b = from_rotation_vector(rng.normal(size=(6, 3)))
+    a = turn @ b @ from_rotation_vector(0.3 * rng.normal(size=(6, 3)))
+    out = np.empty((3, 3))
+    _mean_turn(to_quaternion(a), to_quaternion(b), out)
+    np.testing.assert_allclose(out, project_so3((a @ b.swapaxes(-1, -2)).sum(0)), atol=1e-6)
+
+
+def test_alignment_turns_about_the_anchor_and_carries_it_along():
+    rng = np.random.default_rng(1)
+    joints = from_rotation_vector(rng.normal(size=(1, 3, 3)))
+    turn, anchor, moved = from_rotation_vector(rng.normal(size=3)), rng.normal(size=3), rng.normal(size=3)
+    bones = rigid.make(from_rotation_vector(rng.normal(size=(1, 2, 3))), rng.normal(size=(1, 2, 3)))
+    source = Sources(np.zeros((1, 1), np.int32), np.ones((1, 1)), np.ones(1, np.int64))
+    got = blend(
+        source,
+        bones,
+        PartMotion(to_quaternion(turn @ joints), moved[None]),
+        PartMotion(to_quaternion(joints), anchor[None]),
+        align=True,
+    )
+    want = rigid.make(turn @ bones[0, :, :, :3], (bones[0, :, :, 3] - anchor) @ turn.T + moved)
+    np.testing.assert_allclose(got[0], want, atol=1e-9)
+
+
+def test_bone_frames_stand_at_centroids_and_go_back():
+    rng = np.random.default_rng(2)
+    rest, weights = rng.normal(size=(20, 3)), rng.dirichlet(np.ones(4), 20)
+    centres = centroids(rest, weights)
+    np.testing.assert_allclose(centres[1], (weights[:, 1] @ rest) / weights[:, 1].sum())
+    transforms = rigid.make(from_quaternion(rng.normal(size=(3, 4, 4))), rng.normal(size=(3, 4, 3)))
+    np.testing.assert_allclose(to_frames(transforms, centres)[..., 3], rigid.apply(transforms, centres))
+    np.testing.assert_allclose(from_frames(to_frames(transforms, centres), centres), transforms, atol=1e-12)
+
+
+def test_dynamics_of_a_falling_spinning_root():
+    fps, frames = 50.0, 40
+    time = np.arange(frames) / fps
+    spin = np.array([0.0, 2.0, 0.0])  # rad/s about the axis up
+    rotation = from_rotation_vector(time[:, None] * spin)
+    pivot = np.array([0.3, 1.0, 0.2])
+    position = np.stack([0 * time, 5 - 4.905 * time**2, 0 * time], -1)
+    root = rigid.make(rotation, position - rotation @ pivot)
+    got = root_dynamics(root, pivot, np.array([0, frames]), fps)
+    np.testing.assert_allclose(got[:, 0], np.tile([0.0, 1, 0], (frames, 1)), atol=1e-12)
+    np.testing.assert_allclose(got[1:-1, 1, 1], -9.81 * time[1:-1], atol=1e-9)
+    np.testing.assert_allclose(got[2:-2, 2], np.tile([0, -9.81, 0], (frames - 4, 1)), atol=1e-9)
+    np.testing.assert_allclose(got[:, 3], np.tile(spin, (frames, 1)), atol=1e-9)
+
+
+def test_dynamics_do_not_reach_over_a_cut():
+    root = rigid.identity(6, dtype=float)
+    root[3:, 0, 3] = 100.0  # a jump exactly at the cut
+    assert np.all(root_dynamics(root, np.zeros(3), np.array([0, 3, 6]), 30.0)[:, 1:] == 0)

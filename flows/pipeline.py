@@ -43,7 +43,7 @@ def plan(case: Case, graph: Graph) -> Planned:
 
     bones = config["bones"]
     clusters = add("clusters", schema.CLUSTER, bones, "clusters", train=train, canonical=canonical)["clusters"]
-    decompose = schema.SSDR if bones["decomposition"] == "ssdr" else schema.RIGID
+    decompose = schema.SSDR if bones["kind"] == "ssdr" else schema.RIGID
     skinning = add("bones", decompose, bones, "skinning", train=train, canonical=canonical, clusters=clusters)[
         "skinning"
     ]
@@ -100,3 +100,37 @@ def _skeleton(settings: dict, add, train, test, canonical, skinning) -> dict[str
         return add("poses", schema.POSES, settings["poses"], "poses", **inputs)["poses"]
 
     return {"surface": surface, "curve": curve, "skeleton": skeleton, "poses": fit(train), "query": fit(test)}
+
+
+def plan_pictures(planned: list[Planned], graph: Graph) -> list[Node]:
+    """The figures of a report: for every dataset, its last case and the errors of up to four methods or variants."""
+    found: list[Node] = []
+    for dataset in dict.fromkeys(p.case.dataset for p in planned):
+        cases = [p for p in planned if p.case.dataset == dataset]
+        first = [p for p in cases if p.case.variant == cases[0].case.variant]
+        shown = (first if len(first) > 1 else cases)[:4]
+        found += _pictures(shown, graph)
+    return found
+
+
+def _pictures(shown: list[Planned], graph: Graph) -> list[Node]:
+    lead = shown[-1]
+
+    def add(function: str, settings: dict, **inputs: object) -> Node:
+        path = f"tasks.evaluation.pictures:{function}"
+        return graph.add("figures", path, settings, outputs=("picture",), case=lead.case.dataset, **inputs)
+
+    def take(*names: str) -> dict:
+        return {n: lead.nodes["motion" if n == "train" else n] for n in names}
+
+    labels = [p.case.config["animate"]["label"] for p in shown]
+    if len(set(labels)) < len(labels):
+        labels = [p.case.variant for p in shown]
+    animations = {label: p.nodes["animation"] for label, p in zip(labels, shown, strict=True)}
+    return [
+        add("error_picture", {"focus": labels[-1]}, **take("test", "canonical"), animations=animations),
+        add("skeleton_picture", {}, **take("train", "canonical", "skeleton", "parts")),
+        add("parts_picture", {}, **take("train", "canonical", "skinning", "parts")),
+        add("bones_picture", {}, **take("train", "canonical", "skinning")),
+        add("count_picture", {}, **take("train", "canonical", "clusters")),
+    ]

@@ -32,6 +32,15 @@ DATABASE = "tasks.motion.database:build_database"
 PARTS = "tasks.motion.parts:find_parts"
 EVALUATE = "tasks.evaluation.metrics:evaluate"
 
+REPORT = {
+    "name": str,
+    "title": str,
+    "path": str,
+    "figures": bool,
+    "baselines": list[str],
+    "paper_table": int | None,
+    "note": str,
+}
 FROM_RUN = {"seed"}  # arguments that come from the top of the config
 RENAMED = {"lambda_": "lambda"}  # Python keywords that are the field's names in the config
 
@@ -60,23 +69,28 @@ def schema(config: dict) -> dict[str, object]:
             "poses": settings(POSES),
             **{name: settings(function) for name, function in JOINTS.items()},
         }
-    bones = {"decomposition": Literal["ssdr", "clusters"], **settings(CLUSTER)}
-    bones |= settings(SSDR if config["bones"].get("decomposition") != "clusters" else RIGID)
+    bones = {"kind": Literal["ssdr", "clusters"], **settings(CLUSTER)}
+    bones |= settings(SSDR if config["bones"].get("kind") != "clusters" else RIGID)
     return {
         "seed": int,
         "dataset": {
             "kind": str,
             "status": Literal["paper", "substitute"],
-            "paper_column": str | None,
+            "stands_for": str | None,
             **settings(load_function(dataset.get("kind", ""))),
         },
         "split": settings(SPLIT),
         "bones": bones,
         "skeleton": skeleton | settings(CANONICAL, rename={"choice": "canonical"}),
-        "animate": {"name": str, "function": str, **settings(animate_function(animate.get("function", "")))},
+        "animate": {
+            "name": str,
+            "label": str,
+            "function": str,
+            **settings(animate_function(animate.get("function", ""))),
+        },
         "parts": settings(PARTS),
         "evaluate": settings(EVALUATE),
-        "report": {"name": str, "path": str, "figures": bool, "baseline": str | None, "note": str},
+        "report": REPORT,
         "store": {"path": str},
         "runner": {"kind": Literal["threads", "processes"], "workers": int},
         "sweep": {"datasets": list[str] | None, "methods": list[str] | None, "ablations": list[str] | None},

@@ -215,6 +215,17 @@ class Metrics:
 
 
 @dataclass(frozen=True)
+class Picture:
+    """A figure. name: its file's stem; caption: one line for readers; pixels: (H, W, 3) uint8 RGB, or None for a
+    drawing, whose text is svg."""
+
+    name: str
+    caption: str
+    pixels: np.ndarray | None = None
+    svg: str = ""
+
+
+@dataclass(frozen=True)
 class Training:
     """All that a method may learn from: nothing of the test clips is in here."""
 
@@ -227,7 +238,7 @@ class Training:
 
 
 _KINDS = (Rig, Motion, Canonical, Clusters, Skinning, Surface, Curve, Skeleton, Poses, Parts, Database, Training)
-VALUES = {kind.__name__: kind for kind in (*_KINDS, Animation, Metrics)}
+VALUES = {kind.__name__: kind for kind in (*_KINDS, Animation, Metrics, Picture)}
 
 
 def same(a: object, b: object) -> bool:

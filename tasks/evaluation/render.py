@@ -190,8 +190,14 @@ def paint_skeleton(
             _bone(canvas, pixels[p], pixels[j], unit, colours[j], edge)
         else:
             grow = 1.35 if parents[j] < 0 else 1.0
-            _disc(canvas, pixels[j], 0.62 * unit * grow, edge)
-            _disc(canvas, pixels[j], 0.40 * unit * grow, colours[j] if parents[j] >= 0 else np.ones(3))
+            disc(canvas, pixels[j] / SUPERSAMPLE, 0.62 * size * grow, edge)
+            disc(canvas, pixels[j] / SUPERSAMPLE, 0.40 * size * grow, colours[j] if parents[j] >= 0 else np.ones(3))
+
+
+def disc(canvas: np.ndarray, at: tuple[float, float], radius: float, colour: np.ndarray) -> None:
+    """Paints a disc. at, radius: in final pixels; colour: RGB in 0..1."""
+    x, y, r = (round(v * SUPERSAMPLE * 16) for v in (*at, radius))
+    cv2.circle(canvas, (x, y), r, to_bytes(colour).tolist(), -1, cv2.LINE_AA, 4)
 
 
 def text(
@@ -328,8 +334,3 @@ def _bone(canvas: np.ndarray, a: np.ndarray, b: np.ndarray, unit: float, colour:
         shape = np.stack([a, a + 0.18 * along + wide * side, b + 0.3 * wide * side, b - 0.3 * wide * side])
         shape = np.concatenate([shape, [a + 0.18 * along - wide * side]])
         cv2.fillPoly(canvas, [np.round(shape * 16).astype(np.int32)], to_bytes(fill).tolist(), cv2.LINE_AA, 4)
-
-
-def _disc(canvas: np.ndarray, at: np.ndarray, radius: float, colour: np.ndarray) -> None:
-    centre = tuple(np.round(at * 16).astype(int).tolist())
-    cv2.circle(canvas, centre, round(radius * 16), to_bytes(colour).tolist(), -1, cv2.LINE_AA, 4)

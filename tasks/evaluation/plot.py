@@ -1,0 +1,167 @@
+"""Line charts as SVG text that reads on light and dark pages; no plotting library."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from html import escape
+
+import numpy as np
+
+WIDTH, HEIGHT = 560, 340
+LEFT, RIGHT, TOP, BOTTOM = 66, 18, 22, 48
+COLOURS = ("#3b7dd8", "#e0772b", "#2f9e6e", "#c2456b", "#8a63c9", "#a98f1f", "#2ba6ba", "#8d5a3b")
+
+_STYLE = """
+.chart { font: 13px system-ui, sans-serif; color: #22252b; max-width: 100%; height: auto }
+.chart text { fill: currentColor }
+.chart .grid { stroke: currentColor; stroke-opacity: .14 }
+.chart .axis { stroke: currentColor; stroke-opacity: .6 }
+.chart .mark { stroke: currentColor; stroke-opacity: .55; stroke-dasharray: 4 4 }
+@media (prefers-color-scheme: dark) { .chart { color: #e6e8ec } }
+"""
+
+
+@dataclass(frozen=True)
+class Series:
+    """One line. x, y: (n,) values; spread: (n,) half height of the band around it, or None."""
+
+    name: str
+    x: np.ndarray
+    y: np.ndarray
+    spread: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class _Axis:
+    """Takes values to pixels. start, stop: of the axis in pixels; logarithmic where ``log``."""
+
+    low: float
+    high: float
+    start: float
+    stop: float
+    log: bool
+
+    def __call__(self, value: float) -> float:
+        low, high = (math.log10(v) if self.log else v for v in (self.low, self.high))
+        at = math.log10(max(value, self.low)) if self.log else value
+        return self.start + (at - low) / (high - low) * (self.stop - self.start)
+
+    def ticks(self) -> list[float]:
+        if self.log:
+            decades = range(math.floor(math.log10(self.low)), math.ceil(math.log10(self.high)) + 1)
+            steps = (1, 2, 5) if self.high / self.low < 1e3 else (1,)
+            marks = [s * 10.0**d for d in decades for s in steps]
+        else:
+            step = round_up((self.high - self.low) / 6)
+            marks = [
+                i * step for i in range(math.ceil(self.low / step - 1e-9), math.floor(self.high / step + 1e-9) + 1)
+            ]
+        return [m for m in marks if self.low * (1 - 1e-9) <= m <= self.high * (1 + 1e-9)]
+
+
+def round_up(value: float, steps: tuple[float, ...] = (1, 2, 2.5, 5, 10)) -> float:
+    """The next of these steps times a power of ten; 1 for nothing."""
+    if not value > 0:
+        return 1.0
+    power = 10.0 ** math.floor(math.log10(value))
+    return next(step * power for step in steps if step * power >= value * (1 - 1e-9))
+
+
+def lines(
+    series: list[Series],
+    *,
+    x: str,
+    y: str,
+    log_x: bool = False,
+    log_y: bool = False,
+    mark: tuple[float, str] | None = None,
+) -> str:
+    """A chart of lines with points and bands. x, y: the axes' labels with units; log_x, log_y: logarithmic axes, which
+    need positive values; mark: (value, words) of an upright dashed line. -> the text of an SVG."""
+    xs, ys = (np.concatenate([np.asarray(v, float) for v in vs]) for vs in (_all_x(series), _all_y(series)))
+    across = _axis(xs, LEFT, WIDTH - RIGHT, log_x, from_zero=False)
+    up = _axis(ys, HEIGHT - BOTTOM, TOP, log_y, from_zero=True)
+    parts = [*_frame(across, up, x, y)]
+    if mark:
+        at = across(mark[0])
+        anchor, shift = ("end", -6) if at > (LEFT + WIDTH) / 2 else ("start", 6)
+        parts.append(f'<line class="mark" x1="{at:.1f}" x2="{at:.1f}" y1="{TOP}" y2="{HEIGHT - BOTTOM}"/>')
+        parts.append(f'<text x="{at + shift:.1f}" y="{TOP + 12}" text-anchor="{anchor}">{escape(mark[1])}</text>')
+    for i, one in enumerate(series):
+        parts += _line(one, across, up, COLOURS[i % len(COLOURS)])
+    if len(series) > 1:
+        parts += _names(series)
+    head = f'<svg xmlns="http://www.w3.org/2000/svg" class="chart" viewBox="0 0 {WIDTH} {HEIGHT}" width="{WIDTH}"'
+    label = escape(f"{y} against {x}", quote=True)
+    return f'{head} role="img" aria-label="{label}"><style>{_STYLE}</style>' + "\n".join(parts) + "</svg>\n"
+
+
+def _all_x(series: list[Series]) -> list:
+    return [one.x for one in series]
+
+
+def _all_y(series: list[Series]) -> list:
+    bands = [np.asarray(one.y) + side * one.spread for one in series if one.spread is not None for side in (-1, 1)]
+    return [*(one.y for one in series), *bands]
+
+
+def _axis(values: np.ndarray, start: float, stop: float, log: bool, from_zero: bool) -> _Axis:
+    low, high = float(values.min()), float(values.max())
+    if log:
+        if low <= 0:
+            raise ValueError(f"a logarithmic axis needs positive values, got {low}")
+        return _Axis(low / 1.08, high * 1.08, start, stop, log)
+    if from_zero and low >= 0:
+        low = 0.0
+    pad = 0.05 * (high - low) or 0.5 * abs(high) or 1.0
+    return _Axis(low if from_zero and low == 0 else low - pad, high + pad, start, stop, log)
+
+
+def _frame(across: _Axis, up: _Axis, x: str, y: str) -> list[str]:
+    right, floor = WIDTH - RIGHT, HEIGHT - BOTTOM
+    parts = []
+    for value in up.ticks():
+        at = up(value)
+        parts.append(f'<line class="grid" x1="{LEFT}" x2="{right}" y1="{at:.1f}" y2="{at:.1f}"/>')
+        parts.append(f'<text x="{LEFT - 8}" y="{at + 4:.1f}" text-anchor="end">{value:g}</text>')
+    for value in across.ticks():
+        at = across(value)
+        parts.append(f'<line class="axis" x1="{at:.1f}" x2="{at:.1f}" y1="{floor}" y2="{floor + 5}"/>')
+        parts.append(f'<text x="{at:.1f}" y="{floor + 20}" text-anchor="middle">{value:g}</text>')
+    parts.append(f'<line class="axis" x1="{LEFT}" x2="{right}" y1="{floor}" y2="{floor}"/>')
+    parts.append(f'<text x="{(LEFT + right) / 2}" y="{HEIGHT - 8}" text-anchor="middle">{escape(x)}</text>')
+    middle = (TOP + floor) / 2
+    parts.append(f'<text transform="translate(16 {middle}) rotate(-90)" text-anchor="middle">{escape(y)}</text>')
+    return parts
+
+
+def _line(one: Series, across: _Axis, up: _Axis, colour: str) -> list[str]:
+    order = np.argsort(one.x, kind="stable")
+    xs, ys = np.asarray(one.x, float)[order], np.asarray(one.y, float)[order]
+    dots = [(across(a), up(b)) for a, b in zip(xs, ys, strict=True)]
+    parts = []
+    if one.spread is not None:
+        half = np.asarray(one.spread, float)[order]
+        above = [(across(a), up(b)) for a, b in zip(xs, ys + half, strict=True)]
+        below = [(across(a), up(b)) for a, b in zip(xs, ys - half, strict=True)]
+        parts.append(f'<polygon points="{_points([*above, *below[::-1]])}" fill="{colour}" fill-opacity=".18"/>')
+    parts.append(f'<polyline points="{_points(dots)}" fill="none" stroke="{colour}" stroke-width="2"/>')
+    if len(dots) <= 60:
+        parts += [f'<circle cx="{a:.1f}" cy="{b:.1f}" r="3" fill="{colour}"/>' for a, b in dots]
+    return parts
+
+
+def _points(dots: list[tuple[float, float]]) -> str:
+    return " ".join(f"{a:.1f},{b:.1f}" for a, b in dots)
+
+
+def _names(series: list[Series]) -> list[str]:
+    """The legend: upper right, one line a series."""
+    parts = []
+    for i, one in enumerate(series):
+        y, colour = TOP + 6 + 18 * i, COLOURS[i % len(COLOURS)]
+        parts.append(f'<text x="{WIDTH - RIGHT - 30}" y="{y + 4}" text-anchor="end">{escape(one.name)}</text>')
+        parts.append(f'<line x1="{WIDTH - RIGHT - 24}" x2="{WIDTH - RIGHT}" y1="{y}" y2="{y}" stroke="{colour}"')
+        parts[-1] += ' stroke-width="3"/>'
+    return parts

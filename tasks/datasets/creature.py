@@ -6,6 +6,7 @@ follow from a few numbers and a seed, so that every stage has a truth to be held
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import ModuleType
 from typing import Literal
 
@@ -13,9 +14,9 @@ import numpy as np
 
 from tasks.datasets import creature_animal, creature_figure
 from tasks.datasets import creature_shape as shape
-from tasks.datasets.creature_dynamics import GRAVITY, Masses, swing
+from tasks.datasets.creature_dynamics import Masses, displace
 from tasks.datasets.creature_motion import Puppet
-from tasks.datasets.creature_soft import Cloth, cloth_masses, lobe_masses
+from tasks.datasets.creature_soft import masses_of
 from tasks.errors import InputError
 from tasks.geometry import kinematics, rigid, skinning
 from tasks.values import Motion, Rig
@@ -93,12 +94,7 @@ def skin_weights(
 def soft_masses(kind: ModuleType, parts: list, vertices: np.ndarray, weights: np.ndarray) -> list[Masses]:
     """The masses of every soft region."""
     nearest = shape.part_distances(parts, vertices).argmin(0)
-    return [
-        cloth_masses(s, parts[s.part], nearest, vertices, weights)
-        if isinstance(s, Cloth)
-        else lobe_masses(s, nearest, vertices, weights)
-        for s in kind.soft()
-    ]
+    return [masses_of(s, parts, nearest, vertices, weights) for s in kind.soft()]
 
 
 def perform(
@@ -120,14 +116,10 @@ def deform(
     bones = kinematics.forward(parents, joints.astype(np.float32), rotations, translations)
     points = skinning.skin(vertices.astype(np.float32), weights, bones)
     for m in masses:
-        blended = np.einsum("mj,fjab->fmab", m.hold, bones.astype(np.float64))
-        goals = rigid.apply(blended, m.rest)
-        turned = blended[..., :3] @ GRAVITY
-        picked = [p for p in parts if p.joint in m.avoid]
-        ends, radii = capsules(picked, names, bones)
-        away = swing(m, goals, turned, ends, radii, FPS, softness)
-        moved = m.spread.any(1)
-        points[:, moved] += np.einsum("nm,fmi->fni", m.spread[moved], away).astype(np.float32)
+        ends, radii = capsules([p for p in parts if p.joint in m.avoid], names, bones)
+        moved = np.flatnonzero(np.diff(m.spread.indptr))
+        own = replace(m, spread=m.spread[moved])
+        points[:, moved] = displace(own, bones, points[:, moved], ends, radii, fps=FPS, softness=softness)
     return points
 
 

@@ -95,13 +95,14 @@ def soft() -> list[Lobe | Pad]:
     ears = [[i for i, p in enumerate(body) if p.joint == f"ear_{side}"] for side in "lr"]
     tail = tuple(i for i, p in enumerate(body) if p.joint.startswith("tail"))
     trunk = tuple(i for i, p in enumerate(body) if p.joint in ("spine", "chest", "pelvis"))
+    back = ((0, 0.655, -0.47), (0, 0.65, -0.58), (0, 0.67, -0.74), (0, 0.715, -0.95))
     lobes: list[Lobe | Pad] = [
         Pad(trunk, (0, 0.46, -0.07), (0.17, 0.15, 0.24), 2.2, 6.0, 0.18, 0.06, 0.06),
-        Lobe(tail, (0, 0.655, -0.50), (0, 0.71, -0.92), 1.3, 7.0, 0.18, 0.2, 0.06),
+        Lobe(tail, back, 9, 1.6, 6.0, 3.0, 0.2, 0.15),
     ]
     for side, own in zip("lr", ears, strict=True):
-        root, tip = mirrored((0.062, 1.0, 0.415), side), mirrored((0.12, 1.205, 0.37), side)
-        lobes.append(Lobe(tuple(own), root, tip, 2.0, 9.0, 0.15, 0.1, 0.045))
+        axis = (mirrored((0.055, 0.98, 0.42), side), mirrored((0.115, 1.19, 0.37), side))
+        lobes.append(Lobe(tuple(own), axis, 7, 2.2, 8.0, 4.0, 0.15, 0.08))
     return lobes
 
 

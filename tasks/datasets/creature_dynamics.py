@@ -1,8 +1,8 @@
 """Soft parts that lag and swing: masses on springs, carried along by the bones (the truth that LBS cannot explain).
 
-A soft region holds masses. Each is tied to where the skeleton would put it (its goal), to its neighbours, and feels
-gravity beyond what the rest shape already bears; skirt and hair are kept out of limbs. The skin takes over the masses'
-displacement from their goals, so with stiff enough ties, or softness 0, it is linear blend skinning again.
+A soft region holds masses. Each is tied to where the skeleton would put it (its goal) and to its neighbours, and feels
+gravity; the rest shape is in balance with gravity. Skirt and hair are kept out of limbs. The skin moves as the masses
+move and turn against their goals, so with stiff enough ties, or softness 0, it is linear blend skinning again.
 """
 
 from __future__ import annotations
@@ -10,136 +10,163 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse as sparse
 from numba import njit
 
-SUBSTEPS = 16  # springs at 60 rad/s with a dozen neighbours stay stable up to about 8 ms; this is 2 ms at 30 fps
+from tasks.geometry import rigid, rotations
+
+SUBSTEPS = 16  # springs at 12 Hz with a dozen neighbours stay stable up to about 6 ms; this is 2 ms at 30 fps
 GRAVITY = np.array([0.0, -9.81, 0.0])
 
 
 @dataclass(frozen=True)
 class Masses:
-    """Masses of one soft region, M of them, S springs.
+    """Masses of one soft region, M of them, S springs; all weigh the same.
 
-    rest: (M, 3); tie: (M,) angular frequency of the tie to the goal in rad/s, inf for masses that sit on it;
-    damping: share of critical; limit: metres at which the tie has become twice as stiff; springs: (S, 2);
-    stretch: (S,) their angular frequency; drag: 1/s against still air; spread: (N, M) how the skin follows them;
-    hold: (M, J) how they follow the joints;
-    avoid: names of the parts it may not enter; margin: metres kept from them.
+    rest: (M, 3); hold: (M, J) how they follow the joints; spread: (N, M) how the skin follows them;
+    tie: (M,) angular frequency of the tie to the goal in rad/s, inf for masses that sit on it; damping: share of
+    critical; limit: metres at which the tie has become twice as stiff; springs: (S, 2), length: (S,) at which they
+    pull nothing, stretch: (S,) their angular frequency; drag: 1/s against still air; avoid: joints whose parts it may
+    not enter; margin: metres kept from them.
     """
 
     rest: np.ndarray
+    hold: np.ndarray
+    spread: sparse.csr_matrix
     tie: np.ndarray
     damping: float
     limit: float
     springs: np.ndarray
+    length: np.ndarray
     stretch: np.ndarray
     drag: float
-    spread: np.ndarray
-    hold: np.ndarray
     avoid: tuple[str, ...]
     margin: float
 
 
-def farthest_points(points: np.ndarray, first: int, spacing: float) -> np.ndarray:
-    """Indices of points about ``spacing`` apart, each the farthest from those before it."""
-    chosen = [first]
-    gap = np.linalg.norm(points - points[first], axis=1)
-    while gap.max() > spacing:
-        chosen.append(int(gap.argmax()))
-        gap = np.minimum(gap, np.linalg.norm(points - points[chosen[-1]], axis=1))
-    return np.array(chosen)
-
-
-def near_pairs(points: np.ndarray, reach: float) -> np.ndarray:
-    """(S, 2) pairs of points nearer to each other than ``reach``, each once."""
-    d = np.linalg.norm(points[:, None] - points[None], axis=2)
-    return np.argwhere(np.triu(d < reach, 1)).reshape(-1, 2)
-
-
-def spread_over(points: np.ndarray, masses: np.ndarray, reach: float, mask: np.ndarray) -> np.ndarray:
-    """(N, M) smooth interpolation from masses to skin points, rows sum to the mask (normalised Wendland C2)."""
-    d = np.linalg.norm(points[:, None] - masses[None], axis=2)
-    reach = np.maximum(reach, 1.5 * d.min(1, keepdims=True))
-    q = np.minimum(d / reach, 1.0)
-    kernel = (1 - q) ** 4 * (4 * q + 1)
-    return kernel / kernel.sum(1, keepdims=True) * mask[:, None]
-
-
-def swing(
-    masses: Masses,
-    goals: np.ndarray,
-    turned: np.ndarray,
+def displace(
+    m: Masses,
+    bones: np.ndarray,
+    skin: np.ndarray,
     limbs: np.ndarray,
     radii: np.ndarray,
+    *,
     fps: float,
     softness: float,
 ) -> np.ndarray:
-    """Displacement of the masses from their goals, (F, M, 3), starting at rest on the first goals.
+    """The skin after the masses have swung, starting at rest in the first frame's pose.
 
-    goals: (F, M, 3); turned: (F, M, 3) rest gravity turned with the bones; limbs: (F, C, 2, 3) ends of the capsules to
-    stay out of, radii: (C, 2). Time steps are semi-implicit in ties and damping, so any tie is stable.
+    bones: (F, J, 3, 4); skin: (F, N, 3) as linear blend skinning puts it; limbs: (F, C, 2, 3) ends of the capsules to
+    stay out of, radii: (C, 2) -> (F, N, 3) float32.
     """
-    tie = np.where(np.isinf(masses.tie), 0.0, masses.tie)
-    rest_length = np.linalg.norm(masses.rest[masses.springs[:, 0]] - masses.rest[masses.springs[:, 1]], axis=1)
+    blended = np.einsum("mj,fjab->fmab", m.hold, bones.astype(np.float64))
+    goals = rigid.apply(blended, m.rest)
+    # what the tie must bear for the rest shape to stand still, turned with the bones
+    borne = (blended[..., :3] @ balance(m)[..., None])[..., 0]
+    tie = np.where(np.isinf(m.tie), 0.0, m.tie)
     path = integrate(
-        np.ascontiguousarray(goals, np.float64),
-        np.ascontiguousarray(GRAVITY - turned, np.float64),
+        goals,
+        GRAVITY + borne,
         tie**2 / softness,
-        2.0 * masses.damping * tie / np.sqrt(softness),
-        np.isinf(masses.tie),
-        masses.limit,
-        masses.springs.astype(np.int64),
-        rest_length,
-        masses.stretch**2,
-        masses.drag,
+        2.0 * m.damping * tie / np.sqrt(softness),
+        np.isinf(m.tie),
+        m.limit,
+        m.springs,
+        m.length,
+        m.stretch**2,
+        m.drag,
         np.ascontiguousarray(limbs, np.float64),
-        radii + masses.margin,
+        radii + m.margin,
         1.0 / (fps * SUBSTEPS),
         SUBSTEPS,
     )
-    return path - goals
+    turn = turns(path, goals, m.springs) - np.eye(3)
+    shift = path - goals - (turn @ goals[..., None])[..., 0]
+    out = skin.copy()
+    for f, moves in enumerate(rigid.make(turn, shift)):
+        blend = (m.spread @ moves.reshape(-1, 12)).reshape(-1, 3, 4)
+        out[f] += rigid.apply(blend, skin[f]).astype(np.float32)
+    return out
+
+
+def balance(m: Masses) -> np.ndarray:
+    """(M, 3) accelerations that hold the masses at rest against gravity and the springs' pull."""
+    force = np.tile(GRAVITY, (len(m.rest), 1))
+    pull(m.rest, np.zeros_like(m.rest), m.springs, m.length, m.stretch**2, force)
+    return -force
+
+
+def turns(path: np.ndarray, goals: np.ndarray, springs: np.ndarray) -> np.ndarray:
+    """Rotations that best carry each mass's springs from goal to path, (F, M, 3, 3).
+
+    As in shape matching (Mueller et al. 2005); a little identity keeps a straight chain from rolling about itself.
+    """
+    frames, count = goals.shape[:2]
+    i, j = springs.T
+    ones = np.ones(2 * len(springs))
+    incidence = sparse.csr_matrix((ones, (np.concatenate([i, j]), np.tile(np.arange(len(i)), 2))), (count, len(i)))
+    new, old = path[:, j] - path[:, i], goals[:, j] - goals[:, i]
+    out = np.empty((frames, count, 3, 3))
+    for f in range(frames):
+        h = (incidence @ (new[f, :, :, None] * old[f, :, None, :]).reshape(-1, 9)).reshape(-1, 3, 3)
+        size = incidence @ (old[f] ** 2).sum(1)
+        out[f] = rotations.project_so3(h + 0.05 * size[:, None, None] * np.eye(3))
+    return out
 
 
 @njit(cache=True, nogil=True)
 def integrate(
     goals, gravity, tie, damping, pinned, limit, springs, length, stretch, drag, limbs, radii, dt, substeps
 ):  # fmt: skip
-    """Positions of the masses at the frames, (F, M, 3); goals run along a cubic through the frames."""
+    """Positions of the masses at the frames, (F, M, 3); goals run along a cubic through the frames.
+
+    Symplectic Euler, implicit in ties and damping, so any tie is stable.
+    """
     frames, count = goals.shape[0], goals.shape[1]
     out = np.empty_like(goals)
-    x, goal, limb = goals[0].copy(), goals[0].copy(), limbs[0].copy()
-    v, force, pace = np.zeros_like(x), np.zeros_like(x), np.zeros_like(x)
+    x, goal, next_goal = goals[0].copy(), goals[0].copy(), goals[0].copy()
+    limb, next_limb = limbs[0].copy(), limbs[0].copy()
+    v, force = np.zeros_like(x), np.zeros_like(x)
     out[0] = x
     for f in range(frames - 1):
         for step in range(1, substeps + 1):
             s = step / substeps
-            new_goal = between(goals, f, s)
-            pace = (new_goal - goal) / dt
-            goal = new_goal
-            new_limb = limbs[f] + s * (limbs[f + 1] - limbs[f])
+            between(goals, f, s, next_goal)
+            next_limb[:] = limbs[f] + s * (limbs[f + 1] - limbs[f])
             force[:] = gravity[f] + s * (gravity[f + 1] - gravity[f]) - drag * v
             pull(x, v, springs, length, stretch, force)
             for m in range(count):
                 if pinned[m]:
-                    x[m], v[m] = goal[m], pace[m]
+                    for i in range(3):
+                        v[m, i] = (next_goal[m, i] - goal[m, i]) / dt
+                        x[m, i] = next_goal[m, i]
                     continue
-                away = np.sum((goal[m] - x[m]) ** 2) / limit**2
-                k, c = tie[m] * (1.0 + away), damping[m]
-                v[m] = (v[m] + dt * (force[m] + k * (goal[m] - x[m]) + c * pace[m])) / (1.0 + dt * c + dt * dt * k)
-                x[m] = x[m] + dt * v[m]
-                keep_out(x[m], v[m], limb, new_limb, radii, dt)
-            limb = new_limb
+                away = 0.0
+                for i in range(3):
+                    away += (next_goal[m, i] - x[m, i]) ** 2
+                k, c = tie[m] * (1.0 + away / limit**2), damping[m]
+                for i in range(3):
+                    pace = (next_goal[m, i] - goal[m, i]) / dt
+                    pushed = v[m, i] + dt * (force[m, i] + k * (next_goal[m, i] - x[m, i]) + c * pace)
+                    v[m, i] = pushed / (1.0 + dt * c + dt * dt * k)
+                    x[m, i] += dt * v[m, i]
+                keep_out(x[m], v[m], limb, next_limb, radii, dt)
+            goal[:] = next_goal
+            limb[:] = next_limb
         out[f + 1] = x
     return out
 
 
 @njit(cache=True, nogil=True)
-def between(goals, f, s):
-    """Catmull-Rom between frames f and f + 1 at 0 < s <= 1."""
-    a, b, last = goals[f], goals[f + 1], goals.shape[0] - 1
-    ta, tb = 0.5 * (b - goals[max(f - 1, 0)]), 0.5 * (goals[min(f + 2, last)] - a)
+def between(goals, f, s, out):
+    """Catmull-Rom between frames f and f + 1 at 0 < s <= 1, into ``out``."""
+    before, after = max(f - 1, 0), min(f + 2, goals.shape[0] - 1)
     s2, s3 = s * s, s * s * s
-    return (2 * s3 - 3 * s2 + 1) * a + (s3 - 2 * s2 + s) * ta + (3 * s2 - 2 * s3) * b + (s3 - s2) * tb
+    for m in range(goals.shape[1]):
+        for i in range(3):
+            a, b = goals[f, m, i], goals[f + 1, m, i]
+            ta, tb = 0.5 * (b - goals[before, m, i]), 0.5 * (goals[after, m, i] - a)
+            out[m, i] = (2 * s3 - 3 * s2 + 1) * a + (s3 - 2 * s2 + s) * ta + (3 * s2 - 2 * s3) * b + (s3 - s2) * tb
 
 
 @njit(cache=True, nogil=True)
@@ -163,20 +190,29 @@ def pull(x, v, springs, length, stretch, force):
 @njit(cache=True, nogil=True)
 def keep_out(x, v, before, after, radii, dt):
     """Moves one mass out of the floor and of the capsules, and takes from its speed what runs into them."""
-    if x[1] < 0.01:
-        x[1] = 0.01
+    if x[1] < 0.02:
+        x[1] = 0.02
         v[1] = max(v[1], 0.0)
     for c in range(len(radii)):
-        a = after[c, 0]
-        axis = after[c, 1] - a
-        t = min(max(np.dot(x - a, axis) / max(np.dot(axis, axis), 1e-12), 0.0), 1.0)
-        at = a + t * axis
-        d = x - at
-        far = np.sqrt(np.dot(d, d)) + 1e-12
+        a, b = after[c, 0], after[c, 1]
+        along = size = 0.0
+        for i in range(3):
+            along += (x[i] - a[i]) * (b[i] - a[i])
+            size += (b[i] - a[i]) ** 2
+        t = min(max(along / max(size, 1e-12), 0.0), 1.0)
+        far = 0.0
+        for i in range(3):
+            far += (x[i] - a[i] - t * (b[i] - a[i])) ** 2
+        far = np.sqrt(far) + 1e-12
         depth = radii[c, 0] + t * (radii[c, 1] - radii[c, 0]) - far
-        if depth > 0.0:
-            normal = d / far
-            at_before = before[c, 0] + t * (before[c, 1] - before[c, 0])
-            into = np.dot(normal, (at - at_before) / dt - v)
-            x += depth * normal
-            v += max(into, 0.0) * normal
+        if depth <= 0.0:
+            continue
+        into = 0.0
+        for i in range(3):
+            at = a[i] + t * (b[i] - a[i])
+            was = before[c, 0, i] + t * (before[c, 1, i] - before[c, 0, i])
+            into += (x[i] - at) / far * ((at - was) / dt - v[i])
+        for i in range(3):
+            normal = (x[i] - a[i] - t * (b[i] - a[i])) / far
+            x[i] += depth * normal
+            v[i] += max(into, 0.0) * normal

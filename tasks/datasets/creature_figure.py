@@ -94,10 +94,11 @@ def soft() -> list[Lobe | Pad | Cloth]:
     """Skirt, pony tail and chest."""
     body = parts()
     torso = tuple(i for i, p in enumerate(body) if p.joint == "chest")
+    hair = ((0, 1.64, -0.165), (0, 1.50, -0.225), (0, 1.29, -0.225))
     legs = tuple(f"{n}_{side}" for n in ("thigh", "shin") for side in "lr")
     return [
         Cloth(len(body) - 1, 32, 9, 0.7, 3.0, 0.15, 0.35, legs),
-        Lobe((9, 10), (0, 1.635, -0.165), (0, 1.30, -0.23), 1.1, 6.0, 0.15, 0.25, 0.055, ("chest", "neck")),
+        Lobe((9, 10), hair, 8, 1.0, 5.0, 1.5, 0.12, 0.25, True, ("chest", "neck")),
         Pad(torso, (0, 1.27, 0.13), (0.14, 0.10, 0.10), 2.4, 6.0, 0.2, 0.04, 0.045),
     ]
 

@@ -6,48 +6,64 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from tasks.errors import InputError
+from tasks.geometry.measure import diagonal
 from tasks.skeleton import orient, remesh, solid
 from tasks.skeleton.manifold import components_of, is_closed
+from tasks.skeleton.mend import mend
 from tasks.values import Canonical, Surface
+
+_KEPT = 0.98  # of triangles and points must be left on a mended mesh for it to stand in for the shape
+_NEAR = 0.01  # of the bounding-box diagonal
+_FLAT = 1e-4  # least over largest singular value of points that span a volume
 
 
 def closed_surface(canonical: Canonical, *, vertices: int, cells: int, neighbours: int) -> Surface:
     """One closed component round the canonical shape, with about `vertices` vertices.
 
-    A mesh that is closed, one component and already between half and twice that size is used as it is; another size
-    is remeshed. Everything else (open, several components, bad triangles, bare points) is rebuilt: the border of the
-    solid that the generalised winding number tells from its surroundings (Jacobson et al. 2013), on a grid with
-    `cells` cells along the longest side. Bare points get normals from their `neighbours` nearest points.
+    A closed mesh of one component between half and twice that size is used as it is; another size is refined or
+    decimated. Holes are capped and a few bad triangles dropped. What is still not one closed component (separate
+    parts, soups, bare points) is rebuilt: the border of the solid that the generalised winding number tells from its
+    surroundings (Jacobson et al. 2013; Barill et al. 2018), on a grid of `cells` along the longest side. Bare points
+    get their normals from `neighbours` nearest points.
 
-    Raises InputError when the points span no volume or a setting is out of range.
+    Raises InputError when the points enclose no volume or a setting is out of range.
     """
-    _check_settings(vertices, cells, neighbours)
+    _check(canonical, vertices, cells, neighbours)
     points = canonical.points.astype(np.float64)
-    position, faces = _mesh(canonical, points, cells, neighbours)
+    position, faces = _one_component(points, canonical.faces, cells, neighbours)
     if not vertices / 2 <= len(position) <= vertices * 2:
         position, faces = remesh.to_count(position, faces, vertices)
+    if _volume(position, faces) < 0:
+        faces = faces[:, ::-1]
     of_point = cKDTree(position).query(points)[1]
     return Surface(position.astype(np.float32), faces.astype(np.int32), of_point.astype(np.int32))
 
 
-def _mesh(canonical: Canonical, points: np.ndarray, cells: int, neighbours: int) -> tuple[np.ndarray, np.ndarray]:
-    if np.linalg.matrix_rank(points - points.mean(0), tol=1e-4 * np.abs(points - points.mean(0)).max()) < 3:
-        raise InputError("Canonical.points", expected="points that span a volume", found="points in a plane or line")
-    if canonical.faces is None:
-        soup, faces = orient.discs(points, neighbours)
-        return solid.border(soup, faces, points, cells)
-    faces = canonical.faces.astype(np.int64)
+def _one_component(
+    points: np.ndarray, faces: np.ndarray | None, cells: int, neighbours: int
+) -> tuple[np.ndarray, np.ndarray]:
+    if faces is None:
+        return solid.border(*orient.discs(points, neighbours), points, cells)
+    faces = faces.astype(np.int64)
     if is_closed(faces, len(points)) and components_of(faces, len(points))[0] == 1:
-        return (points, faces) if _volume(points, faces) > 0 else (points, faces[:, ::-1])
-    return solid.border(points, faces, points, cells)
+        return points, faces
+    position, mended = mend(points, faces)
+    if len(mended) < _KEPT * len(faces):  # a soup rather than a damaged mesh
+        return solid.border(points, faces, points, cells)
+    _, part = components_of(mended, len(position))
+    used, largest = np.unique(mended[part == np.argmax(np.bincount(part))], return_inverse=True)
+    distance = cKDTree(position[used]).query(points)[0]
+    if np.mean(distance < _NEAR * diagonal(points)) >= _KEPT:
+        return position[used], largest.reshape(-1, 3)
+    return solid.border(position, mended, points, cells)
 
 
 def _volume(vertices: np.ndarray, faces: np.ndarray) -> float:
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    a, b, c = (vertices[faces[:, k]] - vertices[0] for k in range(3))
     return float(np.einsum("ij,ij->", a, np.cross(b, c))) / 6.0
 
 
-def _check_settings(vertices: int, cells: int, neighbours: int) -> None:
+def _check(canonical: Canonical, vertices: int, cells: int, neighbours: int) -> None:
     for name, value, low, high in (
         ("vertices", vertices, 100, 1_000_000),
         ("cells", cells, 16, 1024),
@@ -55,3 +71,9 @@ def _check_settings(vertices: int, cells: int, neighbours: int) -> None:
     ):
         if not low <= value <= high:
             raise InputError(f"skeleton.surface.{name}", expected=f"{low} to {high}", found=str(value))
+    spread = canonical.points - canonical.points.mean(axis=0)
+    extent = np.linalg.svd(spread.astype(np.float64), compute_uv=False)
+    if len(spread) < 4 or not extent[2] > _FLAT * extent[0]:
+        raise InputError(
+            "Canonical.points", expected="points that span a volume", found=f"{len(spread)} points in a plane or a line"
+        )

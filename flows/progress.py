@@ -26,6 +26,7 @@ class Progress:
     def __init__(self, graph: Graph, show: bool = True) -> None:
         self.total = len(graph.nodes)
         self.finished = 0
+        self._start = time.monotonic()
         self.console = Console(quiet=not show, highlight=False)
         self._events: Path | None = None
         self._read = 0
@@ -61,6 +62,14 @@ class Progress:
     def note(self, text: str) -> None:
         """A remark that the user should see."""
         self.console.print(Text(f"  {text}", "yellow"))
+
+    def finish(self, tables: list, folder: Path, computed: int) -> None:
+        """The tables, and where the report lies."""
+        for table in tables:
+            self.console.print()
+            self.console.print(table)
+        how = "nothing was computed, all was cached" if not computed else f"{computed} of {self.total} stages computed"
+        self.console.print(f"\n{how}; {time.monotonic() - self._start:.1f} s; report in {folder}")
 
     def _line(self, node: Node, how: Text, rest: str) -> None:
         with self._lock:

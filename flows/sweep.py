@@ -8,7 +8,7 @@ from pathlib import Path
 
 from flows.config import Case
 from flows.graph import Graph, Node, short
-from flows.pipeline import Planned, plan
+from flows.pipeline import Planned, plan, plan_pictures
 from flows.progress import Progress
 from flows.server import server
 from flows.stage import Job, run
@@ -41,11 +41,12 @@ def run_sweep(cases: list[Case], show: bool = True) -> Path:
     Store(config["store"]["path"])  # a store that cannot be used is said before anything starts
     graph = Graph()
     planned = [plan(case, graph) for case in cases]
+    pictures = plan_pictures(planned, graph) if config["report"]["figures"] else []
     with server():
-        return Path(_flow(config, graph, planned, show)(config["report"]["name"], len(cases)))
+        return Path(_flow(config, graph, planned, pictures, show)(config["report"]["name"], len(cases)))
 
 
-def _flow(config: dict, graph: Graph, planned: list[Planned], show: bool):
+def _flow(config: dict, graph: Graph, planned: list[Planned], pictures: list[Node], show: bool):
     """The flow of a sweep; its parameters are what the run's page shows."""
     from prefect import flow
 
@@ -57,11 +58,11 @@ def _flow(config: dict, graph: Graph, planned: list[Planned], show: bool):
         with Progress(graph, show) as progress:
             outcome = compute(graph, config, progress)
             raise_first(graph, outcome)
-            folder, tables = write(planned, graph, outcome.refs, outcome.computed, Store(config["store"]["path"]))
-        publish(folder, tables)
-        if show:
-            progress.finish(tables, folder, len(outcome.computed))
-        return str(folder)
+            store = Store(config["store"]["path"])
+            report = write(planned, pictures, graph, outcome.refs, outcome.computed, store)
+        publish(report.folder, report.tables)
+        progress.finish(report.shown, report.folder, len(outcome.computed))
+        return str(report.folder)
 
     return sweep
 

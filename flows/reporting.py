@@ -1,0 +1,107 @@
+"""From artefacts to a report: rows, tables, figures and provenance of the finished cases."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from omegaconf import OmegaConf
+
+from flows.config import CONF, NO_ABLATION
+from flows.graph import Graph, Node
+from flows.pipeline import Planned
+from flows.provenance import provenance
+from flows.store import Ref, Store
+
+UNSEEN = ("rmse_pct", "rmse", "rmse_coordinate")
+MOTION = ("velocity_rmse", "speed_ratio", "max_error")
+RIG = ("bones_rmse_pct", "bones_rmse", "bones_count", "skeleton_rmse_pct", "joints_count")
+
+
+@dataclass(frozen=True)
+class Report:
+    """A written report. tables: Markdown; shown: the same for the terminal."""
+
+    folder: Path
+    tables: str
+    shown: list
+
+
+def write(
+    planned: list[Planned], pictures: list[Node], graph: Graph, refs: dict[str, Ref], computed: set[str], store: Store
+) -> Report:
+    """Writes a report's folder and returns what to show of it."""
+    from tasks.evaluation import report, typeset
+    from tasks.evaluation.rows import join
+
+    settings = planned[0].case.config["report"]
+    rows = join([_rows(p, refs, store) for p in planned])
+    tables = _tables(planned, rows, settings)
+    figures = [(node.cases[0], store.load(refs[node.id], "picture")) for node in pictures]
+    folder = Path(settings["path"]).expanduser() / settings["name"]
+    origin = provenance([p.case for p in planned], graph, refs, computed)
+    report.write_report(folder, rows, tables, figures, origin)
+    markdown = "\n".join(typeset.markdown(t) for t in tables)
+    return Report(folder, markdown, [typeset.terminal(t) for t in tables])
+
+
+def _rows(case: Planned, refs: dict[str, Ref], store: Store):
+    from tasks.evaluation.rows import rows_of
+
+    ref = refs[case.metrics.id]
+    config = case.case.config
+    return rows_of(
+        store.load(ref, "metrics"),
+        experiment=config["report"]["name"],
+        dataset=case.case.dataset,
+        subject=_subject(case, refs, store),
+        method=case.case.method,
+        variant=_variant(case),
+        seed=config["seed"],
+        key=ref.key,
+    )
+
+
+def _tables(planned: list[Planned], rows, settings: dict) -> list:
+    from tasks.evaluation.paper import paper_of
+    from tasks.evaluation.tables import build
+
+    paper = paper_of(OmegaConf.to_container(OmegaConf.load(CONF / "paper" / "gaussianimate.yaml")))
+    datasets = {p.case.dataset: p.case.config["dataset"] for p in planned}
+    lead = rows[rows["method"] == planned[-1].case.method]
+    common = {
+        "labels": {p.case.method: p.case.config["animate"]["label"] for p in planned},
+        "data_status": {name: node["status"] for name, node in datasets.items()},
+        "stands_for": {name: node["stands_for"] for name, node in datasets.items() if node["stands_for"]},
+        "baselines": settings["baselines"],
+    }
+    first = build(
+        rows, title=settings["title"], metrics=UNSEEN, notes=_notes(planned, settings),
+        paper=paper if settings["paper_table"] else None, paper_table=settings["paper_table"] or 0, **common,
+    )  # fmt: skip
+    motion = build(rows, title="Motion of the same results", metrics=MOTION, notes=[], **common)
+    rig_notes = ["Bones and skeleton are shared by all methods; errors on the training frames they were fitted to."]
+    rig = build(lead, title="Bones and skeleton", metrics=RIG, notes=rig_notes, **common)
+    return [first, motion, rig]
+
+
+def _notes(planned: list[Planned], settings: dict) -> list[str]:
+    notes = []
+    if any(p.case.config["skeleton"]["kind"] == "curve" for p in planned):
+        notes.append(
+            "Query poses of unseen clips come from inverse kinematics on the unseen geometry, "
+            "as the paper does where the data brings no skeleton."
+        )
+    if all(p.case.config["dataset"]["status"] == "substitute" for p in planned):
+        notes.append("No column is the paper's data: every one is a substitute, its numbers are not the paper's task.")
+    return [*notes, settings["note"]] if settings["note"] else notes
+
+
+def _variant(case: Planned) -> str:
+    return "" if case.case.variant == NO_ABLATION else case.case.variant
+
+
+def _subject(case: Planned, refs: dict[str, Ref], store: Store) -> str:
+    node, output = case.nodes["test"]
+    return re.sub(r"\s+", "_", store.load(refs[node.id], output).name)

@@ -1,0 +1,137 @@
+"""Configs: every file composes, and a mistake is one readable line before torch is imported."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from flows import config, schema
+from flows.source import ROOT
+from tasks.errors import InputError
+
+GROUPS = config.groups()
+FILE = ["dataset=mesh_sequence", "dataset.path=some.npz"]
+NEEDS_PATH = ("mesh_sequence", "rigged_character")
+
+
+@pytest.mark.parametrize("name", GROUPS["experiment"])
+def test_every_experiment_composes(name):
+    cases = config.expand([f"+experiment={name}"])
+    assert cases
+    assert all(case.config["report"]["name"] == name for case in cases)
+    assert config.headline("experiment", name)
+
+
+@pytest.mark.parametrize("group", [g for g in GROUPS if g not in ("experiment", "ablation")])
+def test_every_choice_composes(group):
+    for choice in GROUPS[group]:
+        extra = ["dataset.path=some.npz"] if choice in NEEDS_PATH else []
+        sweep = ["sweep.datasets=null", "sweep.methods=null"]
+        assert config.expand([f"{group}={choice}", *extra, *sweep])
+
+
+@pytest.mark.parametrize("name", GROUPS["ablation"])
+def test_every_ablation_changes_the_config(name):
+    sweep = ["sweep.datasets=null", "sweep.methods=null"]
+    plain = config.expand(sweep)[0]
+    changed = config.expand([*sweep, f"sweep.ablations=[{name}]"])[0]
+    assert changed.variant == name
+    assert changed.config | {"sweep": None} != plain.config | {"sweep": None}
+
+
+def one_line(error: InputError) -> str:
+    text = str(error)
+    assert "\n" not in text
+    return text
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["bones.max_bone=3"], ["bones.max_bone", "max_bones", "did you mean max_bones?"]),
+        (["nonsense=3"], ["nonsense", "dataset", "bones"]),
+        (["bones.max_bones=many"], ["bones.max_bones", "a whole number", "'many'"]),
+        (["bones.max_bones=2.5"], ["bones.max_bones", "a whole number", "2.5"]),
+        (["bones.max_bones=null"], ["bones.max_bones", "a whole number", "None"]),
+        (["animate.align=3"], ["animate.align", "true or false", "3"]),
+        (["animate.represent=head"], ["animate.represent", "one of root, part, residual", "'head'"]),
+        (["method=nope"], ["method", "partmm", "fullmm", "'nope'"]),
+        (["+experiment=nope"], ["experiment", "quick", "table3", "'nope'"]),
+        (["experiment=table3"], ["+experiment=table3"]),
+        (["+bones.max_bones=3"], ["bones.max_bones", "leave out the plus"]),
+        (["+bones.extra=3"], ["bones.extra", "max_bones"]),
+        (["bones"], ["bones", "KEY=VALUE"]),
+        (["bones.max_bones="], ["bones.max_bones"]),
+        (["bones.max_bones=1,2"], ["bones.max_bones", "add -m"]),
+        (["dataset=mesh_sequence", "sweep.datasets=null"], ["dataset.path", "found nothing", "dataset.path="]),
+        (["dataset.kind=nope", "sweep.datasets=null"], ["dataset.kind", "mesh_sequence"]),
+        (["sweep.ablations=[nope]"], ["ablation", "k_1"]),
+        (["sweep.methods=partmm"], ["sweep.methods", "a list"]),
+        (["seed=x"], ["seed", "a whole number"]),
+        (["split.test=3"], ["split.test", "a list"]),
+        (["report.name=${nothing}"], ["nothing"]),
+    ],
+    ids=lambda v: " ".join(v) if isinstance(v, list) else "",
+)
+def test_a_mistake_is_one_line_that_names_what_would_be_right(overrides, words):
+    with pytest.raises(InputError) as caught:
+        config.expand(overrides)
+    text = one_line(caught.value)
+    for word in words:
+        assert word in text, text
+
+
+def test_multirun_is_a_grid_of_variants():
+    cases = config.expand(["method=partmm", "bones.max_bones=10,20", "animate.k=1,3", "sweep.methods=null"], True)
+    assert [c.variant for c in cases if c.dataset == cases[0].dataset] == [
+        f"bones.max_bones={b},animate.k={k}" for b in (10, 20) for k in (1, 3)
+    ]
+    assert {c.config["bones"]["max_bones"] for c in cases} == {10, 20}
+
+
+def test_seeds_are_not_variants():
+    cases = config.expand(["seed=1,2", "sweep.methods=null", "sweep.datasets=null"], True)
+    assert [(c.variant, c.config["seed"]) for c in cases] == [("none", 1), ("none", 2)]
+
+
+def test_what_the_user_types_wins_over_the_experiment():
+    cases = config.expand(["+experiment=ablation_matching", "animate.patch=5"])
+    assert all(c.config["animate"]["patch"] == 5 for c in cases)
+
+
+def test_a_dataset_on_the_command_line_replaces_the_experiments():
+    cases = config.expand(["+experiment=table3", *FILE])
+    assert {c.dataset for c in cases} == {"mesh_sequence"}
+    assert [c.method for c in cases] == ["lbs", "fullmm", "partmm"]
+
+
+def test_a_whole_number_may_stand_for_a_number_and_nothing_else_is_converted():
+    expected = {"a": float, "b": int | None, "c": list[str]}
+    assert schema.check({"a": 1, "b": None, "c": []}, expected) == {"a": 1.0, "b": None, "c": []}
+    assert isinstance(schema.check({"a": 1, "b": 2, "c": []}, expected)["a"], float)
+    for wrong in ({"a": True}, {"a": "1"}, {"b": 1.5}, {"c": [[1]]}):
+        with pytest.raises(InputError):
+            schema.check({"a": 1, "b": 2, "c": []} | wrong, expected)
+
+
+def command(*arguments: str) -> subprocess.CompletedProcess:
+    return subprocess.run(
+        [sys.executable, "-X", "importtime", "-m", "flows.run", *arguments],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["bones.max_bone=3"], ["--cfg"]])
+def test_help_and_mistakes_import_neither_torch_nor_prefect(arguments):
+    done = command(*arguments)
+    assert done.returncode == (2 if "bone" in arguments[0] else 0)
+    imported = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines() if "import time" in line}
+    assert not imported & {"torch", "prefect", "numba", "pandas"}
+    said = [line for line in done.stderr.splitlines() if not line.startswith("import time")]
+    assert len(said) == (1 if done.returncode else 0)

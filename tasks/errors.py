@@ -11,8 +11,9 @@ class InputError(Exception):
 
     def __init__(self, where: str, *, expected: str, found: str, do: str = "") -> None:
         self.where, self.expected, self.found, self.do = where, expected, found, do
-        message = f"{where}: expected {expected}, found {found}"
-        super().__init__(f"{message}; {do}" if do else message)
+        message = f"{where}: expected {expected}, found {found}" + (f"; {do}" if do else "")
+        # names out of files may hold line breaks or worse: one line stays one line
+        super().__init__("".join(c if c.isprintable() else " " for c in message))
 
     def __reduce__(self):  # keyword-only arguments do not survive the default way between processes
         return _rebuild, (self.where, self.expected, self.found, self.do)

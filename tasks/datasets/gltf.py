@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tasks.datasets import validate
 from tasks.datasets.rigging import Decoded, check_tree
 from tasks.errors import InputError
 from tasks.geometry.rotations import from_quaternion
@@ -87,12 +88,13 @@ def read_glb(path: Path, *, fps: float) -> Decoded:
     Vertices at one place with the same weights are welded. Clips are called as in the file, without the armature's name
     before "|". Raises InputError for damaged files and for what is not supported.
     """
-    if not (np.isfinite(fps) and fps > 0):
-        raise InputError("dataset.fps", expected="a rate above zero", found=str(fps))
+    if not 0 < fps <= 1000:
+        raise InputError("dataset.fps", expected="a rate above 0 and up to 1000", found=str(fps))
     glb = Glb(path)
     try:
         return _decode(glb, fps)
-    except (KeyError, IndexError, TypeError, AttributeError) as error:  # JSON of another shape than the standard's
+    except (KeyError, IndexError, TypeError, AttributeError, ValueError, MemoryError) as error:
+        # JSON that is not shaped as the standard says fails in any of these ways
         found = f"{type(error).__name__}: {error}"
         raise InputError(str(path), expected="glTF 2.0", found=found, do="export the file again") from error
 
@@ -131,9 +133,9 @@ def _decode(glb: Glb, fps: float) -> Decoded:
 
 
 def _chunks(path: Path) -> tuple[dict, bytes]:
-    data = path.read_bytes()
-    if path.is_dir() or len(data) < 20 or data[:4] != b"glTF":
-        found = "an empty file" if not data else f"{len(data)} bytes that do not start with glTF"
+    data = validate.read_bytes(path, expected="a binary glTF file")
+    if len(data) < 20 or data[:4] != b"glTF":
+        found = f"{len(data)} bytes that start with {data[:4]!r}"
         raise InputError(str(path), expected="a binary glTF file", found=found, do="export as .glb")
     version, length = struct.unpack_from("<II", data, 4)
     if version != 2:
@@ -148,7 +150,7 @@ def _chunks(path: Path) -> tuple[dict, bytes]:
         at += 8 + size
     try:
         tree = json.loads(chunks.get(JSON_CHUNK, b""))
-    except ValueError as error:  # also covers bytes that are not UTF-8
+    except (ValueError, RecursionError) as error:  # ValueError also covers bytes that are not UTF-8
         raise InputError(f"{path}: JSON", expected="JSON", found=str(error), do="make or download it again") from None
     if not isinstance(tree, dict):
         raise InputError(f"{path}: JSON", expected="an object", found=type(tree).__name__, do="export as glTF 2.0")
@@ -279,17 +281,28 @@ def _joint_worlds(glb: Glb, animation: dict, above: np.ndarray, nodes: list[int]
     times = start + np.arange(int(np.floor((stop - start) * fps + 1e-3)) + 1) / fps
     moved = {}
     for channel, keys in zip(channels, spans, strict=True):
-        if not (np.all(np.diff(keys) > 0) and np.isfinite(keys).all()):
-            glb.fail(f"animation {animation.get('name', '')}", "key times that rise", "times that do not")
-        sampler, path = samplers[channel["sampler"]], channel["target"]["path"]
-        values = glb.array(sampler["output"]).astype(np.float64)
+        target, sampler = channel["target"], samplers[channel["sampler"]]
         how = sampler.get("interpolation", "LINEAR")
-        per_key = 3 if how == "CUBICSPLINE" else 1
-        if values.shape != (per_key * len(keys), len(REST[path])):
-            glb.fail(f"animation {animation.get('name', '')}", f"{per_key * len(keys)} {path} values", len(values))
-        moved[channel["target"]["node"], path] = interpolate(keys, values, times, how, turns=path == "rotation")
+        values = glb.array(sampler["output"]).astype(np.float64)
+        _check_keys(glb, f"animation {animation.get('name', '')}", keys, values, how, target["path"])
+        moved[target["node"], target["path"]] = interpolate(
+            keys, values, times, how, turns=target["path"] == "rotation"
+        )
     worlds: dict[int, np.ndarray] = {}
     return np.stack([_world(glb, n, above, moved, len(times), worlds) for n in nodes], axis=1)
+
+
+def _check_keys(glb: Glb, field: str, keys: np.ndarray, values: np.ndarray, how: str, path: str) -> None:
+    if how not in ("LINEAR", "STEP", "CUBICSPLINE"):
+        glb.fail(field, "LINEAR, STEP or CUBICSPLINE", how)
+    if not (np.all(np.diff(keys) > 0) and np.isfinite(keys).all()):
+        glb.fail(field, "key times that rise", "times that do not")
+    per_key = 3 if how == "CUBICSPLINE" else 1
+    wanted = (per_key * len(keys), len(REST[path]))
+    if values.shape != wanted:
+        glb.fail(field, f"{path} values of shape {wanted}", values.shape)
+    if not np.isfinite(values).all() or (path == "rotation" and not values[per_key // 2 :: per_key].any(1).all()):
+        glb.fail(field, f"finite {path} values", "NaN, infinity or a quaternion of zeros")
 
 
 def interpolate(keys: np.ndarray, values: np.ndarray, times: np.ndarray, how: str, *, turns: bool) -> np.ndarray:

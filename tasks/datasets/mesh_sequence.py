@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 from itertools import pairwise
 from pathlib import Path
@@ -61,7 +62,7 @@ def _folder(path: Path, *, fps: float, faces: bool, unit: str) -> Motion:
             vertices, here = _read(file)
             if vertices.shape != reference.shape:
                 _changed(file, first, "vertices", len(reference), len(vertices))
-            if faces and not _same_topology(here, topology):
+            if faces and not _same_topology(file, here, first, topology):
                 _changed(file, first, "faces", f"the {len(_triangles(first, topology))} faces", "other faces")
             points.append(vertices)
     return validate.motion(
@@ -105,17 +106,16 @@ def _visible(folder: Path) -> list[Path]:
 
 def _read(file: Path) -> tuple[np.ndarray, bytes | np.ndarray]:
     """Vertices (V, 3) and something that tells the topology: OBJ face lines as bytes, PLY faces as an array."""
-    if file.stat().st_size == 0:
-        raise InputError(str(file), expected="a mesh", found="an empty file", do="make or download it again")
-    vertices, topology = _read_obj(file) if file.suffix.lower() == ".obj" else _read_ply(file)
+    data = validate.read_bytes(file, expected="a mesh")
+    vertices, topology = _read_obj(file, data) if file.suffix.lower() == ".obj" else _read_ply(file, data)
     if len(vertices) == 0:
         raise InputError(str(file), expected="a mesh", found="no vertices", do="make or download it again")
     return vertices, topology
 
 
-def _read_obj(file: Path) -> tuple[np.ndarray, bytes]:
+def _read_obj(file: Path, data: bytes) -> tuple[np.ndarray, bytes]:
     """Own reader: other readers split vertices that carry several texture coordinates, which changes their order."""
-    lines = file.read_bytes().splitlines()
+    lines = data.splitlines()
     rows = [line[2:].split()[:3] for line in lines if line[:2] in (b"v ", b"v\t")]
     try:
         vertices = np.array(rows, dtype="S").astype(np.float64).reshape(len(rows), 3)
@@ -133,11 +133,11 @@ def _three_numbers(row: list[bytes]) -> bool:
         return False
 
 
-def _read_ply(file: Path) -> tuple[np.ndarray, np.ndarray]:
+def _read_ply(file: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
     import trimesh  # 0.4 s to import, and only PLY needs it
 
     try:
-        mesh = trimesh.load(file, process=False)
+        mesh = trimesh.load(io.BytesIO(data), file_type="ply", process=False)
     except Exception as error:  # whatever a parser of others trips over is bad input
         found = " ".join(str(error).split())[:120] or type(error).__name__
         raise InputError(str(file), expected="a PLY mesh", found=found, do="make or download it again") from None
@@ -145,8 +145,11 @@ def _read_ply(file: Path) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(mesh.vertices), np.asarray(faces, np.int64)
 
 
-def _same_topology(a: bytes | np.ndarray, b: bytes | np.ndarray) -> bool:
-    return a is b or (a == b if isinstance(a, bytes) else np.array_equal(a, b))
+def _same_topology(file: Path, here: bytes | np.ndarray, first: Path, topology: bytes | np.ndarray) -> bool:
+    """Compares OBJ text before triangles: only exporters that number normals anew in every frame need the latter."""
+    if isinstance(here, bytes) and here == topology:
+        return True
+    return np.array_equal(_triangles(file, here), _triangles(first, topology))
 
 
 def _triangles(file: Path, topology: bytes | np.ndarray) -> np.ndarray:

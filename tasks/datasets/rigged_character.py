@@ -108,7 +108,7 @@ def _check_posed(decoded: Decoded, frames: np.ndarray, expected: np.ndarray) -> 
 
 
 def _shape(path: Path, field: str, array: np.ndarray, kind: str, shape: tuple[int | str, ...]) -> None:
-    """Raises InputError unless the array is of that kind ("f" real, "i" whole) and shape; text stands for any length."""
+    """Raises InputError unless the array is of that kind ("f" real, "i" whole) and shape; text is any length."""
     fits = array.ndim == len(shape) and all(
         isinstance(n, str) or n == m for n, m in zip(shape, array.shape, strict=True)
     )

@@ -24,8 +24,8 @@ def split(motion: Motion, *, by: Literal["clips", "frames"], test: list[str], fr
     by="frames": the last `fraction` of every clip; `test` must be empty.
 
     Frames at which the test repeats a training frame (clips often start from one neutral pose) are left out of the
-    test. Raises InputError when a test clip repeats training frames for the most part, when either side has no
-    frames, and for unknown names.
+    test. Raises InputError when that takes more than half of a test clip (by="frames": of all test frames), when either
+    side has no frames, and for unknown names.
     """
     if by == "clips":
         train, held = _by_clips(motion, test, fraction)
@@ -33,7 +33,7 @@ def split(motion: Motion, *, by: Literal["clips", "frames"], test: list[str], fr
         if test:
             raise InputError("split.test", expected="no names when split.by=frames", found=_list(test))
         train, held = _by_frames(motion, fraction)
-    return train, _without_repeats(train, held)
+    return train, _without_repeats(train, held, each_clip=by == "clips")
 
 
 def choose_clips(motion: Motion, count: int) -> list[int]:
@@ -106,28 +106,33 @@ def _by_frames(motion: Motion, fraction: float) -> tuple[Motion, Motion]:
     return tuple(motion.take_frames([p for p, _ in runs], [n for _, n in runs]) for runs in (train, test))
 
 
-def _without_repeats(train: Motion, test: Motion) -> Motion:
-    """The test without frames that training has; InputError where that takes the most of a clip."""
+def _without_repeats(train: Motion, test: Motion, *, each_clip: bool) -> Motion:
+    """The test without frames that training has; InputError where that takes the most of it (or of each clip)."""
     source = _repeats(train.points, test.points)
     if (source < 0).all():
         return test
+    for run in test.clips() if each_clip else [slice(0, test.frames)]:
+        if np.mean(source[run] >= 0) > MOSTLY:
+            _mostly_repeated(train, test, run, source)
     runs, names = [], []
     for name, clip in zip(test.clip_names, test.clips(), strict=True):
-        seen = source[clip] >= 0
-        if seen.mean() > MOSTLY:
-            first = int(np.flatnonzero(seen)[0])
-            raise InputError(
-                f"{test.name}: test clip {name}",
-                expected="frames that training does not have",
-                found=f"{seen.sum()} of {len(seen)} repeat training frames (its frame {first} is training frame "
-                f"{source[clip.start + first]} of clip {_clip_of(train, source[clip.start + first])})",
-                do="remove the repeated frames from the data, or choose other test clips or another fraction",
-            )
-        edges = np.flatnonzero(np.diff(np.concatenate([[1], seen, [1]])))
+        edges = clip.start + np.flatnonzero(np.diff(np.concatenate([[True], source[clip] >= 0, [True]])))
         for k, (a, b) in enumerate(zip(edges[::2], edges[1::2], strict=True)):
-            runs.append(slice(clip.start + int(a), clip.start + int(b)))
+            runs.append(slice(int(a), int(b)))
             names.append(name if k == 0 else f"{name} ({k + 1})")
     return test.take_frames(runs, names)
+
+
+def _mostly_repeated(train: Motion, test: Motion, run: slice, source: np.ndarray) -> None:
+    repeated = run.start + np.flatnonzero(source[run] >= 0)
+    here, there = int(repeated[0]), int(source[repeated[0]])
+    raise InputError(
+        f"{test.name}: test clip {_place(test, here)}",
+        expected="frames that training does not have",
+        found=f"{len(repeated)} of {run.stop - run.start} that repeat training frames exactly, the first one that of "
+        f"clip {_place(train, there)}",
+        do="remove repeated frames from the data, or choose other test clips (split.test) or another split.fraction",
+    )
 
 
 def _repeats(known: np.ndarray, asked: np.ndarray) -> np.ndarray:
@@ -148,8 +153,9 @@ def _others(motion: Motion, clip: int) -> np.ndarray:
     return np.delete(motion.points, np.r_[frames], axis=0)
 
 
-def _clip_of(motion: Motion, frame: int) -> str:
-    return motion.clip_names[int(np.searchsorted(motion.clip_start, frame, side="right")) - 1]
+def _place(motion: Motion, frame: int) -> str:
+    clip = int(np.searchsorted(motion.clip_start, frame, side="right")) - 1
+    return f"{motion.clip_names[clip]}, frame {frame - motion.clip_start[clip]}"
 
 
 def _check_fraction(fraction: float) -> None:

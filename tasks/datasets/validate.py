@@ -13,14 +13,17 @@ from pathlib import Path
 import numpy as np
 
 from tasks.errors import InputError
+from tasks.geometry import kinematics
 from tasks.geometry.measure import diagonal
 from tasks.geometry.neighbours import components, mesh_edges
+from tasks.geometry.skinning import skin
 from tasks.values import Motion, Rig
 
 LEAST_POINTS = 4  # three points and a frame of reference: below this no rigid transform is defined
+RIG_NOTED = 1e-3  # of the diagonal
 STILL = 1e-6  # of the diagonal: float32 cannot hold a motion smaller than this
-UNREADABLE = (ValueError, EOFError, OSError, KeyError, RuntimeError, NotImplementedError, MemoryError)
-UNREADABLE_ZIP = (*UNREADABLE, zipfile.BadZipFile, zlib.error)
+# what numpy and zipfile raise for damaged, encrypted or foreign archives (NotImplementedError is a RuntimeError)
+UNREADABLE = (ValueError, EOFError, OSError, KeyError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error)
 
 
 def existing_path(path: str, *, expected: str) -> Path:
@@ -34,18 +37,30 @@ def existing_path(path: str, *, expected: str) -> Path:
     return found
 
 
+def read_bytes(path: Path, *, expected: str, count: int = -1) -> bytes:
+    """The file's content, or its first `count` bytes. Raises InputError for a folder, an empty file and one that may not be read."""
+    if path.is_dir():
+        raise InputError(str(path), expected=expected, found="a folder", do="name a file in it")
+    try:
+        with path.open("rb") as stream:
+            data = stream.read(count)
+    except OSError as error:
+        found = f"a file that cannot be read ({error.strerror})"
+        raise InputError(str(path), expected=expected, found=found, do="check its permissions") from None
+    if not data:
+        raise InputError(str(path), expected=expected, found="an empty file", do="make or download it again")
+    return data
+
+
 def read_npz(path: Path, *, required: tuple[str, ...], optional: tuple[str, ...] = ()) -> dict[str, np.ndarray]:
     """The named arrays of an .npz, others unread. Never unpickles: arrays of objects are an InputError."""
-    if path.is_dir():
-        raise InputError(str(path), expected="an .npz file", found="a folder", do="name a file in it")
-    if path.stat().st_size == 0:
-        raise InputError(str(path), expected="an .npz file", found="an empty file", do="make or download it again")
+    head = read_bytes(path, expected="an .npz file", count=4)
     if not zipfile.is_zipfile(path):
-        found = "a truncated .npz" if path.read_bytes()[:4] == b"PK\x03\x04" else "something else"
+        found = "a truncated .npz" if head == b"PK\x03\x04" else "something else"
         raise InputError(str(path), expected="an .npz file (numpy.savez)", found=found, do="make or download it again")
     try:
         archive = np.load(path, allow_pickle=False)
-    except UNREADABLE_ZIP as error:
+    except UNREADABLE as error:
         raise InputError(
             str(path), expected="a readable .npz", found=_line(error), do="make or download it again"
         ) from None
@@ -188,7 +203,20 @@ def notes(motion: Motion) -> list[str]:
     ]
     if still:
         found.append(f"clips that do not move: {', '.join(still)}")
+    if motion.rig is not None and (error := rig_error(motion)) > RIG_NOTED:
+        found.append(f"the given skeleton alone leaves up to {100 * error:.2g} % of the diagonal unexplained")
     return found
+
+
+def rig_error(motion: Motion) -> float:
+    """Largest distance, over the diagonal, of the points from skinning by the data's own skeleton, on up to 16 frames.
+
+    It is more than rounding where the data's joints scale or where points move by more than their joints."""
+    rig = motion.rig
+    frames = np.unique(np.linspace(0, motion.frames - 1, 16).astype(int))
+    pose = kinematics.forward(rig.parents, rig.joints, rig.rotations[frames], rig.translations[frames])
+    shift = skin(motion.rest, rig.weights, pose) - motion.points[frames]
+    return float(np.linalg.norm(shift, axis=2).max()) / diagonal(motion.points[0])
 
 
 def _mesh_notes(shape: np.ndarray, faces: np.ndarray) -> list[str]:
@@ -217,7 +245,7 @@ def _mesh_notes(shape: np.ndarray, faces: np.ndarray) -> list[str]:
 def _read_array(archive: np.lib.npyio.NpzFile, path: Path, key: str) -> np.ndarray:
     try:
         return archive[key]
-    except UNREADABLE_ZIP as error:
+    except UNREADABLE as error:
         pickled = isinstance(error, ValueError) and "allow_pickle" in str(error)
         raise InputError(
             f"{path}: {key}",
@@ -257,7 +285,8 @@ def _largest_shift(points: np.ndarray) -> float:
 
 def _check(ok: bool, where: str, expected: str, found: object, do: str = "") -> None:
     if not ok:
-        raise InputError(where, expected=expected, found=str(found), do=do)
+        text = str(found)
+        raise InputError(where, expected=expected, found=text if len(text) <= 200 else text[:200] + "...", do=do)
 
 
 def _line(error: Exception) -> str:

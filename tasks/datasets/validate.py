@@ -38,7 +38,7 @@ def existing_path(path: str, *, expected: str) -> Path:
 
 
 def read_bytes(path: Path, *, expected: str, count: int = -1) -> bytes:
-    """The file's content, or its first `count` bytes. Raises InputError for a folder, an empty file and one that may not be read."""
+    """The file's content, or its first `count` bytes. InputError for a folder, an empty file, one not to be read."""
     if path.is_dir():
         raise InputError(str(path), expected=expected, found="a folder", do="name a file in it")
     try:

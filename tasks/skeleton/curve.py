@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import igl
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import minimum_spanning_tree
@@ -38,22 +39,29 @@ def curve_skeleton(
     """
     _check_settings(surface, speed, medial, edge, angle, stop, rounds, twig)
     vertices, faces = surface.vertices.astype(np.float64), surface.faces.astype(np.int64)
+    poles = flow.medial_poles(vertices, faces)
+    length = edge * diagonal(vertices)
     mesh, into = flow.contract(
-        vertices,
-        faces,
-        speed=speed,
-        medial=medial,
-        edge=edge * diagonal(vertices),
-        angle=angle,
-        stop=stop,
-        rounds=rounds,
+        vertices, faces, poles, speed=speed, medial=medial, edge=length, angle=angle, stop=stop, rounds=rounds
     )
     nodes, edges, of_vertex = _thin_to_graph(mesh, graph.resolve(into)[: len(vertices)])
     edges = _cut_loops(nodes, edges)
     radius = cKDTree(vertices).query(nodes)[0]
     nodes, edges, of_vertex = graph.drop_twigs(nodes, edges, of_vertex, twig * radius)
+    nodes = _bring_in(nodes, vertices, faces, poles)
     of_vertex = of_vertex.astype(np.int32)
     return Curve(nodes.astype(np.float32), edges.astype(np.int32), of_vertex, of_vertex[surface.of_point])
+
+
+def _bring_in(nodes: np.ndarray, vertices: np.ndarray, faces: np.ndarray, poles: np.ndarray) -> np.ndarray:
+    """Nodes that the flow left outside, where thin parts bend, go to the nearest pole inside."""
+    poles = poles[np.isfinite(poles[:, 0])]
+    poles = poles[igl.fast_winding_number(vertices, faces, poles) > 0.5]
+    outside = igl.fast_winding_number(vertices, faces, nodes) <= 0.5
+    if outside.any() and len(poles):
+        nodes = nodes.copy()
+        nodes[outside] = poles[cKDTree(poles).query(nodes[outside])[1]]
+    return nodes
 
 
 def _thin_to_graph(mesh: halfedge.Mesh, into: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -17,6 +17,7 @@ _SOLVER_ROUNDS = 200
 def contract(
     vertices: np.ndarray,
     faces: np.ndarray,
+    poles: np.ndarray,
     *,
     speed: float,
     medial: float,
@@ -27,14 +28,14 @@ def contract(
 ) -> tuple[Mesh, np.ndarray]:
     """Shrinks until a round takes less than `stop` of the first area away.
 
-    vertices: (V, 3), faces: (T, 3) closed; speed: w_H, small is fast; medial: w_M, pull towards the medial axis;
-    edge: length under which edges collapse; angle: degrees above which triangles are split
+    vertices: (V, 3), faces: (T, 3) closed; poles: (V, 3), NaN where there is none; speed: w_H, small is fast; medial:
+    w_M, pull towards the pole; edge: length under which edges collapse; angle: degrees above which triangles are split
     -> the thin mesh, into: for every vertex ever used, the vertex it was merged into (itself when still there).
     """
     mesh = halfedge.build(vertices, faces, spare=2 * len(vertices))
     room = len(mesh.position)
     pole = np.full((room, 3), np.nan)
-    pole[: len(vertices)] = medial_poles(vertices, faces)
+    pole[: len(vertices)] = poles
     into = np.arange(room)
     frozen = np.zeros(room, np.bool_)
     first_area = last_area = _area(mesh)

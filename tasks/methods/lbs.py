@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from tasks.geometry.kinematics import forward
 from tasks.geometry.skinning import skin
 from tasks.motion.query import check_poses
-from tasks.motion.skeletons import joint_transforms
 from tasks.values import Animation, Poses, Training
 
 
@@ -16,5 +16,6 @@ def animate(training: Training, query: Poses) -> Animation:
     Raises InputError for poses of another skeleton and matrices that are no rotations.
     """
     check_poses(query, training.skeleton, "query")
-    transforms = joint_transforms(training.skeleton, query).astype(np.float32)
-    return Animation(points=skin(training.canonical.points, training.skeleton.weights, transforms))
+    skeleton = training.skeleton
+    transforms = forward(np.asarray(skeleton.parents), skeleton.joints, query.rotations, query.translations)
+    return Animation(points=skin(training.canonical.points, skeleton.weights, transforms))

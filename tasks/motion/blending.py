@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 
 from tasks.geometry.parallel import for_chunks
+from tasks.motion.projection import mean_turn
 from tasks.motion.search import Matches
 
 FRAME_CHUNK = 64
@@ -151,7 +152,7 @@ def _blend(frame, share, count, values, joints, keys, anchor, key_anchor, align,
         for m in range(count[t]):
             g, w = frame[t, m], share[t, m]
             if align:
-                _mean_turn(joints[t], keys[g], turn)
+                mean_turn(joints[t], keys[g], turn)
                 for r in range(3):
                     shift[r] = anchor[t, r]
                     for c in range(3):
@@ -162,43 +163,3 @@ def _blend(frame, share, count, values, joints, keys, anchor, key_anchor, align,
                     for c in range(4):
                         out[t, b, r, c] += x * values[g, b, 0, c] + y * values[g, b, 1, c] + z * values[g, b, 2, c]
                     out[t, b, r, 3] += w * shift[r]
-
-
-@njit(cache=True, nogil=True)
-def _mean_turn(a, b, out):
-    """out = project_so3(sum_j A_j B_j^T) of quaternions a, b (J, 4).
-
-    The projection of a sum of rotations is the principal eigenvector of the sum of q q^T (Markley et al. 2007); ten
-    squarings of that matrix leave it alone, and whatever comes out is a proper rotation.
-    """
-    s = np.zeros((4, 4))
-    q = np.empty(4)
-    for j in range(len(a)):
-        aw, ax, ay, az = a[j, 0], a[j, 1], a[j, 2], a[j, 3]
-        bw, bx, by, bz = b[j, 0], -b[j, 1], -b[j, 2], -b[j, 3]
-        q[0] = aw * bw - ax * bx - ay * by - az * bz
-        q[1] = aw * bx + ax * bw + ay * bz - az * by
-        q[2] = aw * by - ax * bz + ay * bw + az * bx
-        q[3] = aw * bz + ax * by - ay * bx + az * bw
-        for r in range(4):
-            for c in range(4):
-                s[r, c] += q[r] * q[c]
-    square = np.empty((4, 4))
-    for _ in range(10):
-        trace = s[0, 0] + s[1, 1] + s[2, 2] + s[3, 3]
-        for r in range(4):
-            for c in range(4):
-                total = 0.0
-                for i in range(4):
-                    total += s[r, i] * s[i, c]
-                square[r, c] = total / (trace * trace)
-        s[:] = square
-    best = 0
-    for r in range(1, 4):
-        if s[r, r] > s[best, best]:
-            best = r
-    length = np.sqrt(s[best, 0] ** 2 + s[best, 1] ** 2 + s[best, 2] ** 2 + s[best, 3] ** 2)
-    w, x, y, z = s[best, 0] / length, s[best, 1] / length, s[best, 2] / length, s[best, 3] / length
-    out[0, 0], out[0, 1], out[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
-    out[1, 0], out[1, 1], out[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
-    out[2, 0], out[2, 1], out[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import combinations
 from typing import Literal
 
 import numpy as np
@@ -11,6 +12,7 @@ from tasks.motion.skeletons import carrying, model_root, subtree
 from tasks.values import Parts, Skeleton, Skinning
 
 LIMBS = 4  # the paper's five parts are a torso and four limbs
+SIMILAR = 0.8  # limbs on one joint whose sizes differ by less are a pair
 
 
 def find_parts(
@@ -91,32 +93,56 @@ def _automatic(skeleton: Skeleton, moves: np.ndarray, overlap: int) -> dict[str,
 
 
 def _limb_roots(skeleton: Skeleton, moves: np.ndarray) -> list[int]:
-    """Roots of the (at most four) largest disjoint limbs, in joint order.
-
-    The size of a limb is the rest length of its bones. Among all choices of disjoint subtrees this takes the one
-    whose smallest member is largest, then lets each limb grow towards the root as long as it meets no other limb.
-    """
-    parents, below = skeleton.parents, subtree(skeleton.parents)
+    """Roots of at most four limbs, in joint order: the largest by the length of their bones, pairs kept together."""
+    parents, below = np.asarray(skeleton.parents), subtree(skeleton.parents)
     up = np.where(parents < 0, np.arange(len(parents)), parents)
     length = np.linalg.norm(skeleton.joints - skeleton.joints[up], axis=1).astype(np.float64)
     size = below @ np.where(moves, length, 0.0)
-    top = model_root(skeleton)
+    limbs = _disjoint_limbs(parents, below, size, moves, model_root(skeleton))
+    units = _pairs(limbs, parents, size)
+    chosen = max(
+        (sum(some, ()) for n in range(len(units) + 1) for some in combinations(units, n)),
+        key=lambda some: (len(some), size[list(some)].sum()) if len(some) <= LIMBS else (-1, 0.0),
+    )
+    return sorted(chosen)
+
+
+def _disjoint_limbs(parents: np.ndarray, below: np.ndarray, size: np.ndarray, moves: np.ndarray, top: int) -> list[int]:
+    """Disjoint subtrees, among them the four whose smallest is as large as it can be, each grown towards the root as
+    long as it meets no other. Some smaller ones come along, so that a pair's second is there to be chosen."""
     inner = below[top] & moves & (np.arange(len(parents)) != top)
-    ends: np.ndarray = np.zeros(0, int)
-    for threshold in np.unique(size[inner & (size > 0)])[::-1]:
+    sizes = np.unique(size[inner & (size > 0)])[::-1]
+    ends, enough = np.zeros(0, int), 0.0
+    for threshold in sizes:
+        if threshold < enough:
+            break
         large = inner & (size >= threshold)
         smallest = np.flatnonzero(large & ((below & large).sum(1) == 1))  # no other large subtree inside
         if len(smallest) > len(ends):
             ends = smallest
-        if len(ends) >= LIMBS:
-            break
-    ends = ends[np.argsort(-size[ends], kind="stable")][:LIMBS]
+            if len(ends) >= LIMBS and not enough:
+                enough = SIMILAR * threshold
     limbs = []
     for joint in ends:
         while parents[joint] != top and below[parents[joint], ends].sum() == 1:
             joint = parents[joint]
         limbs.append(int(joint))
-    return sorted(limbs)
+    return limbs
+
+
+def _pairs(limbs: list[int], parents: np.ndarray, size: np.ndarray) -> list[tuple[int, ...]]:
+    """Limbs of similar size on one joint, such as two legs, as pairs, closest sizes first; the rest alone."""
+    ratio = {
+        (a, b): min(size[a], size[b]) / max(size[a], size[b])
+        for a, b in combinations(limbs, 2)
+        if parents[a] == parents[b]
+    }
+    left, units = set(limbs), []
+    for a, b in sorted(ratio, key=lambda pair: -ratio[pair]):
+        if ratio[a, b] >= SIMILAR and {a, b} <= left:
+            units.append((a, b))
+            left -= {a, b}
+    return units + [(limb,) for limb in sorted(left)]
 
 
 def _part_root(skeleton: Skeleton, part: np.ndarray) -> int:

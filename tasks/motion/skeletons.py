@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tasks.geometry import kinematics, rigid
-from tasks.values import Poses, Skeleton
+from tasks.values import Skeleton
 
 
 def subtree(parents: np.ndarray) -> np.ndarray:
@@ -34,18 +33,3 @@ def model_root(skeleton: Skeleton) -> int:
             break
         joint = int(children[0])
     return joint
-
-
-def joint_transforms(skeleton: Skeleton, poses: Poses) -> np.ndarray:
-    """Transforms of the joints on canonical points, (F, J, 3, 4) float64."""
-    return kinematics.forward(
-        np.asarray(skeleton.parents),
-        skeleton.joints.astype(np.float64),
-        poses.rotations.astype(np.float64),
-        poses.translations.astype(np.float64),
-    )
-
-
-def to_root(transforms: np.ndarray, root: np.ndarray) -> np.ndarray:
-    """Transforms seen from a moving frame: (F, X, 3, 4) and (F, 3, 4) -> (F, X, 3, 4)."""
-    return rigid.compose(rigid.inverse(root)[:, None], transforms)

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 
 from tasks.geometry import rigid
-from tasks.geometry.rotations import from_quaternion, from_rotation_vector, project_so3, to_quaternion
-from tasks.motion.blending import PartMotion, Sources, _mean_turn, blend, level_shares, window_weights
+from tasks.geometry.rotations import from_rotation_vector, project_so3, to_quaternion
+from tasks.motion.blending import PartMotion, Sources, blend, level_shares, window_weights
 from tasks.motion.dynamics import root_dynamics
-from tasks.motion.frames import centroids, from_frames, to_frames
+from tasks.motion.posed import Posed, centroids
+from tasks.motion.projection import mean_turn, project
+from tests.analytic import planted
 
 
 def test_level_shares_follow_the_recursion():
@@ -32,8 +37,18 @@ def test_mean_turn_is_the_projected_sum_of_rotations():
     b = from_rotation_vector(rng.normal(size=(6, 3)))
     a = turn @ b @ from_rotation_vector(0.3 * rng.normal(size=(6, 3)))
     out = np.empty((3, 3))
-    _mean_turn(to_quaternion(a), to_quaternion(b), out)
+    mean_turn(to_quaternion(a), to_quaternion(b), out)
     np.testing.assert_allclose(out, project_so3((a @ b.swapaxes(-1, -2)).sum(0)), atol=1e-6)
+
+
+def test_projection_is_the_nearest_rotation():
+    rng = np.random.default_rng(3)
+    turns = from_rotation_vector(rng.normal(size=(50, 3)))
+    blends = np.concatenate([turns + 0.3 * rng.normal(size=turns.shape), 1e-3 * turns, rng.normal(size=turns.shape)])
+    clear = np.linalg.svd(blends, compute_uv=False)[:, 1] > 0.05 * np.linalg.norm(blends, axis=(1, 2))
+    np.testing.assert_allclose(project(blends)[clear], project_so3(blends)[clear], atol=1e-6)
+    np.testing.assert_allclose(project(turns[0]), turns[0], atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(project(np.zeros((1, 3, 3)))), 1)  # no answer: still a rotation
 
 
 def test_alignment_turns_about_the_anchor_and_carries_it_along():
@@ -53,14 +68,30 @@ def test_alignment_turns_about_the_anchor_and_carries_it_along():
     np.testing.assert_allclose(got[0], want, atol=1e-9)
 
 
-def test_bone_frames_stand_at_centroids_and_go_back():
+@pytest.mark.parametrize("represent", ["root", "residual"])
+def test_frames_of_bones_go_back_to_the_same_transforms(represent):
+    train = planted.training([planted.gesture(20, 1)])
+    posed = Posed(train, train.database.poses)
+    frames = posed.encode(train.database.bones, represent)
+    np.testing.assert_allclose(posed.decode(frames, represent), train.database.bones, atol=1e-5)
+
+
+def test_bones_that_follow_the_skin_have_no_residual():
+    train = planted.training([planted.gesture(20, 1)])
+    eye = np.eye(16, dtype=np.float32)[np.repeat(np.arange(16), 12)]
+    stiff = replace(train, skeleton=replace(train.skeleton, weights=eye), skinning=replace(train.skinning, weights=eye))
+    posed = Posed(stiff, train.database.poses)
+    residual = posed.encode(posed.world, "residual")
+    np.testing.assert_allclose(residual, np.broadcast_to(np.eye(3, 4), residual.shape), atol=1e-6)
+
+
+def test_a_centroid_is_the_mean_of_the_points_that_a_bone_moves():
     rng = np.random.default_rng(2)
     rest, weights = rng.normal(size=(20, 3)), rng.dirichlet(np.ones(4), 20)
+    weights[:, 3] = 0
     centres = centroids(rest, weights)
     np.testing.assert_allclose(centres[1], (weights[:, 1] @ rest) / weights[:, 1].sum())
-    transforms = rigid.make(from_quaternion(rng.normal(size=(3, 4, 4))), rng.normal(size=(3, 4, 3)))
-    np.testing.assert_allclose(to_frames(transforms, centres)[..., 3], rigid.apply(transforms, centres))
-    np.testing.assert_allclose(from_frames(to_frames(transforms, centres), centres), transforms, atol=1e-12)
+    np.testing.assert_allclose(centres[3], rest.mean(0))
 
 
 def test_dynamics_of_a_falling_spinning_root():

@@ -87,6 +87,14 @@ def test_a_small_tree_beside_four_limbs_goes_to_the_torso():
     assert parts.joints[1:].sum(1).tolist() == [3, 3, 3, 3]
 
 
+def test_a_pair_of_legs_is_not_torn_apart_by_a_long_neck():
+    # pelvis 0 with two legs of four bones; spine 9-10 with two legs of three and a neck of five on joint 10
+    parents = [-1, 0, 1, 2, 3, 0, 5, 6, 7, 0, 9, 10, 11, 12, 10, 14, 15, 10, 17, 18, 19, 20]
+    parts = find_parts(chain(parents), skinned(chain(parents)), kind="auto", named=[], overlap=0, affinity=0.0)
+    assert parts.names == ("torso", "j1", "j5", "j11", "j14")
+    assert np.flatnonzero(parts.joints[0]).tolist() == [0, 9, 10, 17, 18, 19, 20, 21]
+
+
 @pytest.mark.parametrize(("parents", "expected"), [([-1], 1), ([-1, 0, 1, 2], 2), ([-1, 0, 0], 3)])
 def test_fewer_than_four_limbs(parents, expected):
     parts = find_parts(chain(parents), skinned(chain(parents)), kind="auto", named=[], overlap=0, affinity=0.0)

@@ -1,0 +1,121 @@
+"""A run of poses as binding sees it: joints in the world and in the model, and what bones are stored relative to."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+
+from tasks.geometry import kinematics, rigid
+from tasks.geometry.measure import diagonal
+from tasks.geometry.rotations import to_quaternion
+from tasks.motion.blending import PartMotion
+from tasks.motion.dynamics import root_dynamics
+from tasks.motion.parts import bone_affinity
+from tasks.motion.projection import project
+from tasks.motion.search import Keys
+from tasks.motion.skeletons import model_root, subtree
+from tasks.values import Poses, Training
+
+# Radians a unit of gravity direction, body diagonal/s, body diagonal/s^2 and rad/s: the weights of a prototype on
+# clothing (0.3, 0.1 per m/s, 0.1 per g, 0.03 per rad/s) for a body whose bounding box has a diagonal of two metres.
+DYNAMICS = np.array([0.3, 0.2, 0.02, 0.03])
+
+
+class Posed:
+    """Training poses, or those of a query. Transforms are float64.
+
+    world: (F, J, 3, 4) of the joints on canonical points; model: the same seen from the model's root joint;
+    bones are handled as frames, [R | position of the bone's centroid], unrotated at rest. Blending positions of
+    centroids, instead of translations of canonical points, keeps a bone where its sources have it even when their
+    rotations differ.
+    """
+
+    def __init__(self, training: Training, poses: Poses) -> None:
+        skeleton, skinning = training.skeleton, training.skinning
+        self.training, self.poses = training, poses
+        self.root = model_root(skeleton)
+        self.inner = subtree(skeleton.parents)[self.root]
+        self.world = kinematics.forward(
+            np.asarray(skeleton.parents),
+            skeleton.joints.astype(np.float64),
+            poses.rotations.astype(np.float64),
+            poses.translations.astype(np.float64),
+        )
+        self.model = relative(self.world, self.world[:, self.root])
+        self.centres = centroids(skinning.rest, skinning.weights)
+
+    @cached_property
+    def quaternions(self) -> np.ndarray:
+        """(F, J, 4) float32, of the local rotations."""
+        return to_quaternion(self.poses.rotations).astype(np.float32)
+
+    @cached_property
+    def dynamics(self) -> np.ndarray:
+        """(F, 4, 3) gravity, velocity, acceleration and angular velocity of the root, weighted to be compared."""
+        size = diagonal(self.training.canonical.points)
+        pivot = self.training.skeleton.joints[self.root].astype(np.float64)
+        moving = root_dynamics(self.world[:, self.root], pivot, self.poses.clip_start, self.training.database.fps)
+        return moving * (DYNAMICS / np.array([1.0, size, size, 1.0]))[:, None]
+
+    @cached_property
+    def predicted(self) -> np.ndarray:
+        """(F, B, 3, 4) where skinning of the skeleton would carry the bones' frames."""
+        affinity = bone_affinity(self.training.skinning.weights, self.training.skeleton.weights)
+        frames, joints = self.world.shape[:2]
+        blended = (affinity @ self.world.reshape(frames, joints, 12)).reshape(frames, len(affinity), 3, 4)
+        return rigid.make(project(blended[..., :3]), rigid.apply(blended, self.centres))
+
+    def key_joints(self, part: int) -> np.ndarray:
+        """The part's joints below the model's root, which is left out: bones are stored relative to it. A part that
+        has no other joint is compared by the root's."""
+        joints = self.training.parts.joints[part]
+        inner = joints & self.inner
+        inner[self.root] = False
+        return np.flatnonzero(inner if inner.any() else joints)
+
+    def keys(self, part: int, dynamics: float) -> Keys:
+        """What windows of a part are compared by."""
+        extra = (
+            (dynamics * self.dynamics).astype(np.float32) if dynamics > 0 else np.zeros((len(self.world), 0, 3), "f4")
+        )
+        return Keys(self.quaternions[:, self.key_joints(part)], extra, self.poses.clip_start)
+
+    def part_frame(self, part: int, represent: str) -> np.ndarray:
+        """(F, 3, 4) the frame, seen from the model's root, that a part's bones are stored in."""
+        root = int(self.training.parts.roots[part])
+        return self.model[:, root] if represent == "part" else np.broadcast_to(np.eye(3, 4), self.world[:, 0].shape)
+
+    def part_motion(self, part: int, represent: str) -> PartMotion:
+        """Joints and anchor of a part, seen from its frame."""
+        root = int(self.training.parts.roots[part])
+        seen = relative(self.model, self.part_frame(part, represent))
+        turns = to_quaternion(seen[:, self.training.parts.joints[part] & self.inner, :, :3])
+        return PartMotion(turns, rigid.apply(seen[:, root], self.training.skeleton.joints[root].astype(np.float64)))
+
+    def encode(self, transforms: np.ndarray, represent: str) -> np.ndarray:
+        """Transforms of bones on canonical points -> frames seen from the model's root or, as ``residual``, from where
+        skinning would carry them. (F, B, 3, 4)."""
+        transforms = transforms.astype(np.float64)
+        frames = rigid.make(transforms[..., :3], rigid.apply(transforms, self.centres))
+        if represent == "residual":
+            return rigid.compose(rigid.inverse(self.predicted), frames)
+        return relative(frames, self.world[:, self.root])
+
+    def decode(self, frames: np.ndarray, represent: str) -> np.ndarray:
+        """The inverse of :meth:`encode`."""
+        frames = rigid.compose(self.predicted if represent == "residual" else self.world[:, self.root, None], frames)
+        rotation = frames[..., :3]
+        return rigid.make(rotation, frames[..., 3] - (rotation @ self.centres[..., None])[..., 0])
+
+
+def relative(transforms: np.ndarray, frame: np.ndarray) -> np.ndarray:
+    """Transforms seen from a moving frame: (F, X, 3, 4) and (F, 3, 4) -> (F, X, 3, 4)."""
+    return rigid.compose(rigid.inverse(frame)[:, None], transforms)
+
+
+def centroids(rest: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """(N, 3) points and (N, B) weights -> (B, 3) float64; the shape's own centroid for a bone of no weight."""
+    mass = weights.astype(np.float64).sum(0)
+    mean = (weights.astype(np.float64).T @ rest) / np.maximum(mass, 1e-12)[:, None]
+    return np.where(mass[:, None] > 1e-9, mean, rest.mean(0, dtype=np.float64))

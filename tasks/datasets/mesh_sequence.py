@@ -141,8 +141,8 @@ def _read_ply(file: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
     except Exception as error:  # whatever a parser of others trips over is bad input
         found = " ".join(str(error).split())[:120] or type(error).__name__
         raise InputError(str(file), expected="a PLY mesh", found=found, do="make or download it again") from None
-    faces = getattr(mesh, "faces", np.zeros((0, 3)))
-    return np.asarray(mesh.vertices), np.asarray(faces, np.int64)
+    vertices = np.asarray(getattr(mesh, "vertices", np.zeros((0, 3))))  # trimesh makes a scene of an empty PLY
+    return vertices, np.asarray(getattr(mesh, "faces", np.zeros((0, 3))), np.int64)
 
 
 def _same_topology(file: Path, here: bytes | np.ndarray, first: Path, topology: bytes | np.ndarray) -> bool:

@@ -190,6 +190,8 @@ def test_folder_of_ply(tmp_path):
     whole = (tmp_path / "3.ply").read_bytes()
     (tmp_path / "3.ply").write_bytes(whole[: len(whole) // 2])
     rejects(lambda: load(tmp_path), "3.ply")
+    (tmp_path / "3.ply").write_text("ply\nformat ascii 1.0\nend_header\n")
+    rejects(lambda: load(tmp_path), "3.ply", "no vertices")
     (tmp_path / "3.obj").write_text("v 0 0 0")
     rejects(lambda: load(tmp_path), "both .obj and .ply")
 

@@ -35,7 +35,8 @@ def fit_weights(
         q = quadratic - linear[:, :, None] - linear[:, None, :] + (x * x).sum(1)[:, None, None]
         return _solve_points(q, influences, exchanges)
 
-    return np.concatenate(for_chunks(part, len(rest), CHUNK)).astype(np.float32)
+    none = np.zeros((0, bones))
+    return np.concatenate([none, *for_chunks(part, len(rest), CHUNK)]).astype(np.float32)
 
 
 @njit(cache=True, nogil=True)

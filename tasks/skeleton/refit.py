@@ -1,0 +1,90 @@
+"""Weights and joints of a fixed tree refitted to the motion, in turn with the poses."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tasks.geometry.moments import Moments, skin_moments
+from tasks.geometry.sparse_weights import fit_weights
+from tasks.skeleton.inverse_kinematics import solve_poses, transforms_of, warm_start, world_moments
+
+_STEPS = 2  # Gauss-Newton steps a round: the next round goes on from there
+_FIRST_STEPS = 5
+_DAMPING = 1e-4
+_STIFFNESS = 0.01
+
+
+def refit(
+    points: np.ndarray,
+    rest: np.ndarray,
+    parents: np.ndarray,
+    joints: np.ndarray,
+    weights: np.ndarray,
+    *,
+    rounds: int,
+    influences: int,
+    reach: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Alternates poses, weights and joint positions, each of which lowers the skinning error.
+
+    points: (F, N, 3); rest: (N, 3); joints: (J, 3); weights: (N, J); reach: how far a joint may move from where it
+    was found (nought: not at all) -> joints (J, 3) float64 and weights (N, J) float32. Joints without a child and
+    without points keep none.
+    """
+    origin = rest.mean(axis=0, dtype=np.float64)
+    points, rest = points - origin.astype(np.float32), rest - origin
+    start = joints - origin
+    joints, world, root = start, None, None
+    empty = weights.sum(axis=0) <= 0
+    for r in range(rounds):
+        moments = skin_moments(rest, weights, points)
+        if world is None:
+            world, root = warm_start(parents, joints, moments, _STIFFNESS)
+        steps = _STEPS if r else _FIRST_STEPS
+        world, root = solve_poses(parents, joints, moments, world, root, steps=steps, damping=_DAMPING)
+        if reach > 0:
+            joints, root = fit_joints(parents, joints, moments, world, root, anchor=start, reach=reach)
+        transforms = transforms_of(parents, joints, world, root)
+        used = np.flatnonzero(~empty)
+        weights = np.zeros_like(weights, dtype=np.float32)
+        weights[:, used] = fit_weights(rest, points, transforms[:, used], influences=influences, exchanges=2)
+    return joints + origin, weights
+
+
+def fit_joints(
+    parents: np.ndarray,
+    joints: np.ndarray,
+    moments: Moments,
+    world: np.ndarray,
+    root: np.ndarray,
+    *,
+    anchor: np.ndarray,
+    reach: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Joint positions of least skinning error for given rotations: linear least squares, the root's shift of every
+    frame eliminated. Moving joint j by d moves its subtree by (R_parent - R_j) d. Each joint is drawn weakly to its
+    anchor (a hinge leaves the place along its axis open) and stays within ``reach`` of it.
+    """
+    transforms = transforms_of(parents, joints, world, root)
+    a, c = world_moments(parents, moments, transforms)
+    count, n = len(parents), moments.count
+    overlap = a[0, :, :, 3, 3]  # sum_n b_j b_i of the subtrees' summed weights: the same in every frame
+    share = overlap[:, 0]  # sum_n b_j
+    centred = overlap - np.outer(share, share) / n
+    residual = c[:, :, 3] - share[:, None] * c[:, :1, 3] / n  # (F, J, 3)
+    up = np.where(parents < 0, 0, parents)
+    d = world[:, up] - world  # (F, J, 3, 3)
+    normal = np.einsum("fjka,fikb->jaib", d, d, optimize=True) * centred[:, None, :, None]
+    gradient = np.einsum("fjka,fjk->ja", d, residual)
+    hold = 1e-3 * len(world) * np.maximum(np.diagonal(centred), 1e-6 * n)
+    normal = normal.reshape(3 * count, 3 * count)
+    normal[np.arange(3 * count), np.arange(3 * count)] += np.repeat(hold, 3)
+    gradient += hold[:, None] * (joints - anchor)
+    gradient[parents < 0] = 0.0
+    move = -np.linalg.solve(normal, gradient.ravel()).reshape(count, 3)
+    move[parents < 0] = 0.0
+    offset = joints + move - anchor
+    length = np.linalg.norm(offset, axis=1, keepdims=True)
+    moved = anchor + offset * np.minimum(1.0, reach / np.maximum(length, 1e-12))
+    shift = (c[:, 0, 3] + np.einsum("fjab,jb,j->fa", d, moved - joints, share)) / n
+    return moved, root - shift

@@ -29,7 +29,7 @@ figcaption { font-weight: 600; margin: 0 0 .5rem }
 table { border-collapse: collapse; width: 100%; font-size: .92rem; font-variant-numeric: tabular-nums }
 th, td { padding: .42rem .8rem; text-align: right; white-space: nowrap; border-bottom: 1px solid var(--line) }
 thead th { font-weight: 500; color: var(--soft); border-bottom: 0; padding-bottom: .1rem }
-thead th.group { text-align: center; color: var(--ink); font-weight: 600; border-left: 1px solid var(--line) }
+thead th.group { text-align: left; color: var(--ink); font-weight: 600; border-left: 1px solid var(--line) }
 thead tr:last-child th { border-bottom: 1px solid var(--line); padding-bottom: .45rem }
 tbody tr:last-child > * { border-bottom: 0 }
 th:first-child { position: sticky; left: 0; text-align: left; background: var(--page); font-weight: 500;

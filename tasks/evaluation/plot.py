@@ -13,12 +13,13 @@ LEFT, RIGHT, TOP, BOTTOM = 66, 18, 22, 48
 COLOURS = ("#3b7dd8", "#e0772b", "#2f9e6e", "#c2456b", "#8a63c9", "#a98f1f", "#2ba6ba", "#8d5a3b")
 
 _STYLE = """
-.chart { font: 13px system-ui, sans-serif; color: #22252b; max-width: 100%; height: auto }
+.chart { font: 13px system-ui, sans-serif; color: #22252b; background: #fff; max-width: 100%;
+  height: auto; border-radius: 6px }
 .chart text { fill: currentColor }
 .chart .grid { stroke: currentColor; stroke-opacity: .14 }
 .chart .axis { stroke: currentColor; stroke-opacity: .6 }
 .chart .mark { stroke: currentColor; stroke-opacity: .55; stroke-dasharray: 4 4 }
-@media (prefers-color-scheme: dark) { .chart { color: #e6e8ec } }
+@media (prefers-color-scheme: dark) { .chart { color: #e6e8ec; background: #14171c } }
 """
 
 

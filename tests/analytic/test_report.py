@@ -106,8 +106,8 @@ def test_a_defect_while_drawing_leaves_the_earlier_report(tmp_path):
     before = files(tmp_path)
     with pytest.raises(ValueError, match="two figures"):
         write_report(tmp_path, *parts(2.0), [("s", PIXELS), ("s", PIXELS)], PROVENANCE)
+    rows, tables = parts(2.0)
     with pytest.raises(ValueError, match="finite"):
-        rows, tables = parts(2.0)
         write_report(tmp_path, rows.assign(value=np.nan), tables, [], PROVENANCE)
     with pytest.raises(ValueError, match="JSON"):
         write_report(tmp_path, *parts(2.0), [], {"seconds": float("inf")})

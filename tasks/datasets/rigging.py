@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import permutations, product
 from typing import Literal
 
 import numpy as np
@@ -46,14 +47,17 @@ class Decoded:
 def to_motion(decoded: Decoded, *, hierarchy: Literal["attached", "authored"], unit: str) -> Motion:
     """Poses the character and brings its skeleton into the form of :class:`Rig`.
 
-    Mesh space is often smaller than the posed character (100 times for FBX units); rest shape and joints are scaled so
-    that skin transforms become rigid. Joints that move no vertex and carry none that does are left out. hierarchy: see
+    Mesh space is often smaller than the posed character (100 times for FBX units) and lies on its back (z up); rest
+    shape and joints are scaled and turned into the posed character's space, so that skin transforms become rigid and
+    start near the identity. Joints that move no vertex and carry none that does are left out. hierarchy: see
     :func:`single_tree`. Rotations and translations go through :func:`kinematics.local_poses`, so forward kinematics
     and linear blend skinning give the points again, up to what is not rigid in the skin transforms (animated scale).
     """
     weights = _weights(decoded)
     transforms, scale = _unit_scale(decoded, weights)
-    rest, joints = decoded.rest * scale, decoded.joints * scale
+    turn = _upright(transforms, weights)
+    rest, joints = scale * decoded.rest @ turn.T, scale * decoded.joints @ turn.T
+    transforms[..., :3] = transforms[..., :3] @ turn.T
     points = skin(rest, weights, transforms)
     order, parents = single_tree(decoded.parents, joints, weights, transforms, diagonal(points[0]), hierarchy=hierarchy)
     rotation = project_so3(transforms[:, order, :, :3])
@@ -159,6 +163,20 @@ def _unit_scale(decoded: Decoded, weights: np.ndarray) -> tuple[np.ndarray, floa
     transforms = decoded.skin.copy()
     transforms[..., :3] /= scale
     return transforms, scale
+
+
+def _upright(transforms: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """The quarter turns about the axes that come nearest to how the skin is turned on average, (3, 3)."""
+    share = weights.sum(0) / weights.sum()
+    mean = np.einsum("fjab,j->ab", transforms[..., :3], share) / len(transforms)
+    return max(_quarter_turns(), key=lambda turn: round(float((turn * mean).sum()), 6))
+
+
+def _quarter_turns() -> list[np.ndarray]:
+    """The 24 rotations that map axes to axes, the identity first, so that it wins ties."""
+    signs = [np.diag(s) for s in product((1.0, -1.0), repeat=3)]
+    turns = [sign @ np.eye(3)[list(order)] for order in permutations(range(3)) for sign in signs]
+    return [turn for turn in turns if np.linalg.det(turn) > 0]
 
 
 def _leaves_parent(parents: np.ndarray, joints: np.ndarray, transforms: np.ndarray, size: float) -> np.ndarray:

@@ -111,6 +111,21 @@ def test_many_roots_in_any_order_become_one_tree(tmp_path, hierarchy):
     np.testing.assert_allclose(skin(motion.rest, rig.weights, posed), motion.points, atol=1e-3)
 
 
+def test_a_mesh_space_that_lies_down_is_stood_up(tmp_path):
+    """z up in mesh space, y up when posed, as FBX exports are: the rest shape comes out with y up."""
+    lying = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # y to z
+    data = arrays()
+    matrices, bind = data["skin_matrices"].copy(), data["bind_matrices"].copy()
+    matrices[..., :3] = matrices[..., :3] @ lying.T
+    bind[:, :3, 3] = JOINTS @ lying.T
+    down = load(tmp_path, rest_vertices=VERTICES @ lying.T, bind_matrices=bind, skin_matrices=matrices)
+    up = load(tmp_path)
+    np.testing.assert_allclose(down.rest, VERTICES * SCALE, atol=1e-4)
+    np.testing.assert_allclose(down.points, up.points, atol=1e-4)
+    np.testing.assert_allclose(down.rig.joints, up.rig.joints, atol=1e-4)
+    np.testing.assert_allclose(down.rig.rotations, up.rig.rotations, atol=1e-5)
+
+
 def test_joints_that_scale_keep_the_points_and_are_noted(tmp_path):
     matrices = arrays()["skin_matrices"].copy()
     matrices[2, 2, :, :3] *= 1.3

@@ -73,6 +73,8 @@ def test_rigs_reproduce_the_posed_vertices(shared_data, name):
     assert np.abs(skin(motion.rest, rig.weights, posed) - motion.points).max() < 1e-5 * size
     Skeleton(rig.names, rig.parents, rig.joints, rig.weights)  # one root, parents first
     assert moving <= set(rig.names)
+    turned = np.trace(rig.rotations[:, 0].mean(0))  # the rest shape stands as the posed ones do
+    assert turned > 2.0
     np.testing.assert_allclose(rig.weights.sum(1), 1.0, atol=1e-6)
     np.testing.assert_allclose(rig.rotations @ rig.rotations.swapaxes(-1, -2), np.eye(3) + 0 * rig.rotations, atol=1e-5)
 

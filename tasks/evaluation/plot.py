@@ -93,9 +93,42 @@ def lines(
         parts += _line(one, across, up, COLOURS[i % len(COLOURS)])
     if len(series) > 1:
         parts += _names(series)
-    head = f'<svg xmlns="http://www.w3.org/2000/svg" class="chart" viewBox="0 0 {WIDTH} {HEIGHT}" width="{WIDTH}"'
-    label = escape(f"{y} against {x}", quote=True)
-    return f'{head} role="img" aria-label="{label}"><style>{_STYLE}</style>' + "\n".join(parts) + "</svg>\n"
+    return _svg(parts, HEIGHT, f"{y} against {x}")
+
+
+def dots(rows: list[str], series: list[Series], *, x: str, zero: str = "") -> str:
+    """A chart with one line of dots a row. rows: labels, top first; series: one colour each, ``x`` their values in the
+    order of the rows (NaN where a row has none) and ``spread`` half widths of whiskers (``y`` is not used); x: the
+    axis' label with unit; zero: words at an upright dashed line at nought, none for no line. -> the text of an SVG."""
+    left = 24 + int(7.2 * max((len(row) for row in rows), default=0))
+    head = TOP + 22 * (len(series) > 1)
+    floor = head + 12 + 26 * len(rows)
+    height = floor + BOTTOM
+    values = [np.asarray(one.x, float) for one in series]
+    reach = [
+        v + side * one.spread
+        for v, one in zip(values, series, strict=True)
+        if one.spread is not None
+        for side in (-1, 1)
+    ]
+    every = np.concatenate([*values, *reach, [0.0] if zero else []])
+    across = _axis(every[np.isfinite(every)], left, WIDTH - RIGHT, False, from_zero=not zero)
+    parts = _ruler(across, head, floor, (left + WIDTH - RIGHT) / 2, height, x)
+    if zero:
+        at = across(0.0)
+        parts.append(f'<line class="mark" x1="{at:.1f}" x2="{at:.1f}" y1="{head}" y2="{floor}"/>')
+        parts.append(f'<text x="{at + 6:.1f}" y="{floor - 6}" fill-opacity=".7">{escape(zero)}</text>')
+    for r, row in enumerate(rows):
+        y = head + 18 + 26 * r
+        parts.append(f'<text x="{left - 12}" y="{y + 4}" text-anchor="end">{escape(row)}</text>')
+        for i, one in enumerate(series):
+            if np.isfinite(values[i][r]):
+                half = 0.0 if one.spread is None else float(one.spread[r])
+                shift = 5 * (i - (len(series) - 1) / 2)  # whiskers side by side
+                parts += _dot(across, values[i][r], half, y + shift, COLOURS[i % len(COLOURS)])
+    if len(series) > 1:
+        parts += _names_above([one.name for one in series], left)
+    return _svg(parts, height, f"{x} of {', '.join(rows)}")
 
 
 def _all_x(series: list[Series]) -> list:
@@ -125,11 +158,11 @@ def _frame(across: _Axis, up: _Axis, x: str, y: str) -> list[str]:
     for value in up.ticks():
         at = up(value)
         parts.append(f'<line class="grid" x1="{LEFT}" x2="{right}" y1="{at:.1f}" y2="{at:.1f}"/>')
-        parts.append(f'<text x="{LEFT - 8}" y="{at + 4:.1f}" text-anchor="end">{value:g}</text>')
+        parts.append(f'<text x="{LEFT - 8}" y="{at + 4:.1f}" text-anchor="end">{_tick(value)}</text>')
     for value in across.ticks():
         at = across(value)
         parts.append(f'<line class="axis" x1="{at:.1f}" x2="{at:.1f}" y1="{floor}" y2="{floor + 5}"/>')
-        parts.append(f'<text x="{at:.1f}" y="{floor + 20}" text-anchor="middle">{value:g}</text>')
+        parts.append(f'<text x="{at:.1f}" y="{floor + 20}" text-anchor="middle">{_tick(value)}</text>')
     parts.append(f'<line class="axis" x1="{LEFT}" x2="{right}" y1="{floor}" y2="{floor}"/>')
     parts.append(f'<text x="{(LEFT + right) / 2}" y="{HEIGHT - 8}" text-anchor="middle">{escape(x)}</text>')
     middle = (TOP + floor) / 2
@@ -166,3 +199,43 @@ def _names(series: list[Series]) -> list[str]:
         parts.append(f'<line x1="{WIDTH - RIGHT - 24}" x2="{WIDTH - RIGHT}" y1="{y}" y2="{y}" stroke="{colour}"')
         parts[-1] += ' stroke-width="3"/>'
     return parts
+
+
+def _ruler(across: _Axis, top: float, floor: float, middle: float, height: float, x: str) -> list[str]:
+    """Upright grid lines with their numbers, and the label under them."""
+    parts = []
+    for value in across.ticks():
+        at = across(value)
+        parts.append(f'<line class="grid" x1="{at:.1f}" x2="{at:.1f}" y1="{top}" y2="{floor}"/>')
+        parts.append(f'<text x="{at:.1f}" y="{floor + 18}" text-anchor="middle">{_tick(value)}</text>')
+    parts.append(f'<text x="{middle:.1f}" y="{height - 8}" text-anchor="middle">{escape(x)}</text>')
+    return parts
+
+
+def _dot(across: _Axis, value: float, half: float, y: float, colour: str) -> list[str]:
+    parts = []
+    if half > 0:
+        a, b = across(value - half), across(value + half)
+        parts.append(f'<line x1="{a:.1f}" x2="{b:.1f}" y1="{y}" y2="{y}" stroke="{colour}" stroke-width="2"/>')
+    return [*parts, f'<circle cx="{across(value):.1f}" cy="{y}" r="4.5" fill="{colour}" fill-opacity=".85"/>']
+
+
+def _names_above(names: list[str], left: float) -> list[str]:
+    """The legend in one line over the chart."""
+    parts, at = [], left
+    for i, name in enumerate(names):
+        parts.append(f'<circle cx="{at + 5}" cy="{TOP}" r="5" fill="{COLOURS[i % len(COLOURS)]}"/>')
+        parts.append(f'<text x="{at + 15}" y="{TOP + 4}">{escape(name)}</text>')
+        at += 34 + 7.2 * len(name)
+    return parts
+
+
+def _svg(parts: list[str], height: float, label: str) -> str:
+    size = f'viewBox="0 0 {WIDTH} {height}" width="{WIDTH}"'
+    head = f'<svg xmlns="http://www.w3.org/2000/svg" class="chart" {size} role="img"'
+    body = "\n".join(parts)
+    return f'{head} aria-label="{escape(label, quote=True)}"><style>{_STYLE}</style>{body}</svg>\n'
+
+
+def _tick(value: float) -> str:
+    return f"{value:g}".replace("-", "−")

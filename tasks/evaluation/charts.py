@@ -1,0 +1,56 @@
+"""Charts of the rows of metrics.csv, as the text of an SVG."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pandas as pd
+
+from tasks.evaluation import plot
+from tasks.evaluation.metrics import METRICS
+
+
+def ablation_chart(rows: pd.DataFrame, *, metric: str, method: str, labels: Mapping[str, str]) -> str:
+    """What each variant of a method changes against the method as it is, in %, a colour for each subject.
+
+    rows: as in metrics.csv; labels: by "method/variant", "dataset/subject" or either's last part. The change is taken
+    seed by seed; whiskers are its standard deviation. Raises ValueError where the plain method is missing.
+    """
+    chosen = rows[(rows["metric"] == metric) & (rows["method"] == method)]
+    variants = [v for v in dict.fromkeys(chosen["variant"]) if v]
+    series = []
+    for (dataset, subject), group in chosen.groupby(["dataset", "subject"], sort=False):
+        values = group.pivot(index="seed", columns="variant", values="value")
+        if "" not in values:
+            raise ValueError(f"no {method} without a variant on {dataset}/{subject}")
+        change = 100.0 * (values.div(values[""], axis=0) - 1.0).reindex(columns=variants)
+        spread = change.std(ddof=1).fillna(0.0).to_numpy()
+        name = _label(labels, f"{dataset}/{subject}")
+        series.append(plot.Series(name, change.mean().to_numpy(), np.empty(0), spread))
+    names = [_label(labels, f"{method}/{variant}") for variant in variants]
+    text = f"change of {METRICS[metric].label} [%]" + (", left is better" if METRICS[metric].better == "lower" else "")
+    return plot.dots(names, series, x=text, zero=labels.get(method, method))
+
+
+def clips_chart(rows: pd.DataFrame, *, metric: str, dataset: str, subject: str, labels: Mapping[str, str]) -> str:
+    """A metric on each unseen clip, a colour for each method; means over seeds, whiskers their standard deviation.
+
+    Takes the rows named "metric@clip" of one subject. Raises ValueError where there are none.
+    """
+    of_subject = rows[(rows["dataset"] == dataset) & (rows["subject"] == subject) & (rows["variant"] == "")]
+    chosen = of_subject[of_subject["metric"].str.startswith(f"{metric}@")]
+    if chosen.empty:
+        raise ValueError(f"no rows {metric}@clip of {dataset}/{subject}")
+    clips = list(dict.fromkeys(chosen["metric"]))
+    series = []
+    for method, group in chosen.groupby("method", sort=False):
+        by_clip = group.groupby("metric", sort=False)["value"]
+        mean, spread = by_clip.mean().reindex(clips), by_clip.std(ddof=1).reindex(clips).fillna(0.0)
+        series.append(plot.Series(_label(labels, str(method)), mean.to_numpy(), np.empty(0), spread.to_numpy()))
+    names = [clip.partition("@")[2] for clip in clips]
+    return plot.dots(names, series, x=f"{METRICS[metric].label} [{chosen['unit'].iloc[0]}]")
+
+
+def _label(labels: Mapping[str, str], name: str) -> str:
+    return labels.get(name, name.rpartition("/")[2])

@@ -16,6 +16,7 @@ from tasks.datasets.creature_motion import (
     footfalls,
     mirrored,
     offset,
+    raised,
     rise,
     standing,
     straight,
@@ -76,7 +77,7 @@ def parts() -> list[Cone]:
             return mirrored((x, y, z), side)
 
         body += [
-            Cone(f"ear_{side}", at(0.05, 0.965, 0.42), at(0.115, 1.19, 0.37), 0.045, 0.022, 0.04, (1, 1, 0.6)),
+            Cone(f"ear_{side}", at(0.05, 0.965, 0.42), at(0.125, 1.155, 0.38), 0.052, 0.02, 0.04, (1, 1, 0.6)),
             Cone(f"upper_arm_{side}", at(0.085, 0.56, 0.22), at(0.10, 0.365, 0.10), 0.085, 0.052, 0.06),
             Cone(f"forearm_{side}", at(0.10, 0.365, 0.10), at(0.10, 0.15, 0.18), 0.05, 0.034, 0.03),
             Cone(f"fore_paw_{side}", at(0.10, 0.15, 0.18), at(0.10, 0.045, 0.19), 0.033, 0.033, 0.02),
@@ -98,11 +99,11 @@ def soft() -> list[Lobe | Pad]:
     back = ((0, 0.655, -0.47), (0, 0.65, -0.58), (0, 0.67, -0.74), (0, 0.715, -0.95))
     lobes: list[Lobe | Pad] = [
         Pad(trunk, (0, 0.46, -0.07), (0.17, 0.15, 0.24), 2.2, 6.0, 0.18, 0.06, 0.06),
-        Lobe(tail, back, 9, 1.6, 6.0, 3.0, 0.2, 0.15),
+        Lobe(tail, back, 9, 1.7, 6.0, 3.5, 0.3, 0.12),
     ]
     for side, own in zip("lr", ears, strict=True):
-        axis = (mirrored((0.055, 0.98, 0.42), side), mirrored((0.115, 1.19, 0.37), side))
-        lobes.append(Lobe(tuple(own), axis, 7, 2.2, 8.0, 4.0, 0.15, 0.08))
+        axis = (mirrored((0.055, 0.98, 0.42), side), mirrored((0.125, 1.155, 0.38), side))
+        lobes.append(Lobe(tuple(own), axis, 7, 2.4, 8.0, 4.5, 0.2, 0.07))
     return lobes
 
 
@@ -121,7 +122,8 @@ def stand_on(p: Puppet, t: np.ndarray, lean: dict[str, np.ndarray] | None = None
     for which, tip in (("fore", FORE_TIP), ("hind", HIND_TIP)):
         for side in "lr":
             pitch = 0.0 * t if lean is None else lean[which]
-            leg(p, which, side, np.tile(mirrored(tip, side), (len(t), 1)), 0.0 * t, pitch)
+            target = np.tile(mirrored(tip, side), (len(t), 1))
+            leg(p, which, side, raised(target, pitch, 0.08, 0.1), 0.0 * t, pitch)
 
 
 def step(
@@ -135,7 +137,7 @@ def step(
         target, u = footfalls(t, path, home, phase=phase, period=period, duty=duty, lift=lift)
         swing = 0.5 * (1.0 + duty)
         pitch = cyclic(u, (0.0, -0.2), (0.5 * duty, 0.05), (duty, 0.5), (swing, fold), (0.5 + 0.5 * swing, 0.1))
-        leg(p, which, side, target, heading, pitch)
+        leg(p, which, side, raised(target, pitch, 0.08, 0.08), heading, pitch)
 
 
 def walk(p: Puppet, t: np.ndarray, span: float, gain: float) -> None:
@@ -225,13 +227,13 @@ def wag(p: Puppet, t: np.ndarray, span: float, gain: float) -> None:
     """Play bow: front down, rump up, tail wagging fast."""
     s = t / span
     bow = rise(s, 0.02, 0.25) * (1.0 - rise(s, 0.8, 0.99))
-    swing = np.sin(TAU * 2.2 * t) * rise(s, 0.0, 0.15) * (1.0 - rise(s, 0.88, 1.0))
-    turns = [("y", 0.07 * swing), ("x", 0.32 * bow), ("z", 0.05 * swing)]
-    carry(p, t, standing, shift=offset(-0.02 * swing, -0.02 * bow, -0.07 * bow), turns=turns)
+    swing = np.sin(TAU * 1.9 * t) * rise(s, 0.0, 0.15) * (1.0 - rise(s, 0.88, 1.0))
+    turns = [("y", 0.07 * swing), ("x", 0.42 * bow), ("z", 0.05 * swing)]
+    carry(p, t, standing, shift=offset(-0.02 * swing, -0.03 * bow, -0.13 * bow), turns=turns)
     p.turn("spine", ("x", 0.06 * bow), ("y", -0.08 * swing))
     p.turn("neck", ("x", -0.55 * bow))
     p.turn("head", ("x", 0.1 * bow), ("z", 0.1 * swing))
-    tail(p, -0.9 * bow, 1.5 * gain * swing)
+    tail(p, -0.7 * bow, 1.2 * gain * swing)
     stand_on(p, t, {"fore": -0.5 * bow, "hind": 0.15 * bow})
 
 
@@ -249,7 +251,7 @@ def sit(p: Puppet, t: np.ndarray, span: float, gain: float) -> None:
     tail(p, 0.2 - 0.75 * down, 0.3 * np.sin(TAU * 1.3 * t) * down)
     for side in "lr":
         hind = np.array(mirrored(HIND_TIP, side)) + offset(0.02 * down * (1 if side == "l" else -1), 0.0, 0.2 * down)
-        leg(p, "hind", side, hind, 0.0 * t, -0.85 * down)
+        leg(p, "hind", side, raised(hind, -0.85 * down, 0.08, 0.08), 0.0 * t, -0.85 * down)
         lifted = give * gain if side == "r" else 0.0 * t
         fore = np.array(mirrored(FORE_TIP, side)) + offset(0.0, 0.3 * lifted, 0.16 * lifted)
         leg(p, "fore", side, fore, 0.0 * t, 0.5 * lifted * (1 - lifted) * 4 - 0.3 * lifted)
@@ -259,7 +261,7 @@ def shake(p: Puppet, t: np.ndarray, span: float, gain: float) -> None:
     """Shakes itself from head to tail, the twist running backwards."""
     s = t / span
     on = rise(s, 0.05, 0.3) * (1.0 - rise(s, 0.7, 0.95)) * gain
-    a = TAU * 3.0 * t
+    a = TAU * 2.6 * t
     carry(p, t, standing, shift=offset(0.0, -0.03 * on, 0.0), turns=[("z", 0.10 * on * np.sin(a - 1.6))])
     p.turn("spine", ("z", 0.14 * on * np.sin(a - 1.0)))
     p.turn("chest", ("z", 0.16 * on * np.sin(a - 0.5)))

@@ -171,14 +171,14 @@ def between(goals, f, s, out):
 
 @njit(cache=True, nogil=True)
 def pull(x, v, springs, length, stretch, force):
-    """Adds the springs' pull, with a tenth of critical damping along them, to ``force``."""
+    """Adds the springs' pull, with a fifth of critical damping along them, to ``force``."""
     for e in range(len(springs)):
         i, j = springs[e, 0], springs[e, 1]
         d0, d1, d2 = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], x[j, 2] - x[i, 2]
         now = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2) + 1e-12
         d0, d1, d2 = d0 / now, d1 / now, d2 / now
         closing = (v[j, 0] - v[i, 0]) * d0 + (v[j, 1] - v[i, 1]) * d1 + (v[j, 2] - v[i, 2]) * d2
-        push = stretch[e] * (now - length[e]) + 0.2 * np.sqrt(stretch[e]) * closing
+        push = stretch[e] * (now - length[e]) + 0.4 * np.sqrt(stretch[e]) * closing
         force[i, 0] += push * d0
         force[i, 1] += push * d1
         force[i, 2] += push * d2

@@ -16,6 +16,7 @@ from tasks.datasets.creature_motion import (
     footfalls,
     mirrored,
     offset,
+    raised,
     rise,
     standing,
     straight,
@@ -41,7 +42,7 @@ _SIDE = {
 }
 BALL = (0.11, 0.0, 0.09)
 ELBOW = {"l": (-1.0, -1.0, 0.0), "r": (-1.0, 1.0, 0.0)}  # positive turns bend the elbow forward
-SKIRT = Bell("pelvis", ((0.12, 1.05), (0.175, 0.97), (0.24, 0.86), (0.30, 0.72), (0.35, 0.56)), 0.022, 0.92, 0.03)
+SKIRT = Bell("pelvis", ((0.12, 1.05), (0.175, 0.97), (0.24, 0.86), (0.30, 0.72), (0.35, 0.56)), 0.026, 0.92, 0.03)
 
 
 def joints() -> dict[str, tuple[str | None, tuple[float, float, float]]]:
@@ -67,8 +68,8 @@ def parts() -> list[Cone | Bell]:
         Cone("head", (0, 1.66, -0.09), (0, 1.645, -0.16), 0.045, 0.04, 0.03),
         Cone("head", (0, 1.645, -0.16), (0, 1.50, -0.225), 0.04, 0.05, 0.03),
         Cone("head", (0, 1.50, -0.225), (0, 1.30, -0.225), 0.05, 0.022, 0.03),
-        Cone("chest", (0.062, 1.275, 0.075), (0.062, 1.27, 0.078), 0.058, 0.058, 0.05),
-        Cone("chest", (-0.062, 1.275, 0.075), (-0.062, 1.27, 0.078), 0.058, 0.058, 0.05),
+        Cone("chest", (0.05, 1.27, 0.055), (0.06, 1.265, 0.055), 0.065, 0.06, 0.08),
+        Cone("chest", (-0.05, 1.27, 0.055), (-0.06, 1.265, 0.055), 0.065, 0.06, 0.08),
     ]
     for side in "lr":
 
@@ -78,9 +79,8 @@ def parts() -> list[Cone | Bell]:
         body += [
             Cone(f"upper_arm_{side}", at(0.165, 1.37, -0.015), at(0.36, 1.18, -0.02), 0.058, 0.04, 0.04),
             Cone(f"forearm_{side}", at(0.36, 1.18, -0.02), at(0.535, 1.005, 0.0), 0.041, 0.03, 0.02),
-            Cone(f"hand_{side}", at(0.55, 0.99, 0.0), at(0.605, 0.925, 0.008), 0.034, 0.032, 0.03, (1, 1, 0.8)),
-            Cone(f"hand_{side}", at(0.605, 0.925, 0.008), at(0.645, 0.87, 0.012), 0.03, 0.025, 0.02, (1, 1, 0.85)),
-            Cone(f"hand_{side}", at(0.56, 0.985, 0.015), at(0.575, 0.945, 0.065), 0.022, 0.021, 0.02),
+            Cone(f"hand_{side}", at(0.55, 0.99, 0.0), at(0.605, 0.925, 0.008), 0.036, 0.034, 0.03, (1, 1, 0.9)),
+            Cone(f"hand_{side}", at(0.605, 0.925, 0.008), at(0.64, 0.875, 0.012), 0.032, 0.03, 0.02),
             Cone(f"thigh_{side}", at(0.085, 0.90, -0.005), at(0.10, 0.52, 0.01), 0.088, 0.058, 0.03),
             Cone(f"shin_{side}", at(0.10, 0.50, 0.01), at(0.103, 0.36, -0.015), 0.055, 0.055, 0.03),
             Cone(f"shin_{side}", at(0.103, 0.36, -0.015), at(0.105, 0.10, -0.025), 0.055, 0.038, 0.03),
@@ -97,7 +97,7 @@ def soft() -> list[Lobe | Pad | Cloth]:
     hair = ((0, 1.64, -0.165), (0, 1.50, -0.225), (0, 1.29, -0.225))
     legs = tuple(f"{n}_{side}" for n in ("thigh", "shin") for side in "lr")
     return [
-        Cloth(len(body) - 1, 32, 9, 0.7, 3.0, 0.15, 0.35, legs),
+        Cloth(len(body) - 1, 32, 9, 0.9, 3.0, 0.3, 0.35, legs),
         Lobe((9, 10), hair, 8, 1.0, 5.0, 1.5, 0.12, 0.25, True, ("chest", "neck")),
         Pad(torso, (0, 1.27, 0.13), (0.14, 0.10, 0.10), 2.4, 6.0, 0.2, 0.04, 0.045),
     ]
@@ -144,7 +144,7 @@ def step(
             u, (0.0, -0.22), (0.2 * duty, 0.0), (0.6 * duty, 0.05), (duty, heel), (swing, 0.5 * heel),
             (0.4 * swing + 0.6, -0.2),
         )  # fmt: skip
-        leg(p, side, target, heading, pitch)
+        leg(p, side, raised(target, pitch, 0.06, 0.4), heading, pitch)
 
 
 def arms(p: Puppet, *, swing: np.ndarray | float = 0.0, lower: float = 0.45, elbow: np.ndarray | float = 0.3) -> None:
@@ -156,9 +156,9 @@ def arms(p: Puppet, *, swing: np.ndarray | float = 0.0, lower: float = 0.45, elb
 
 def walk(p: Puppet, t: np.ndarray, span: float, gain: float) -> None:
     """Walk with swinging arms and hips."""
-    period, path = 1.05, straight(1.0)
+    period, path = 1.05, straight(0.95)
     a = TAU * t / period
-    shift = offset(0.022 * np.sin(a + 0.3), -0.045 - 0.018 * np.cos(2 * a - 0.4), 0.0)
+    shift = offset(0.022 * np.sin(a + 0.3), -0.03 - 0.016 * np.cos(2 * a - 0.4), 0.0)
     turns = [("y", -0.13 * gain * np.cos(a)), ("z", -0.045 * np.sin(a)), ("x", 0.04)]
     heading = carry(p, t, path, shift=shift, turns=turns)
     p.turn("spine", ("y", 0.12 * gain * np.cos(a)), ("z", 0.05 * np.sin(a)))
@@ -172,7 +172,7 @@ def run(p: Puppet, t: np.ndarray, span: float, gain: float) -> None:
     """Run, leaning forward, elbows bent."""
     period, path = 0.72, straight(2.1)
     a = TAU * t / period
-    shift = offset(0.01 * np.sin(a), -0.06 + 0.035 * gain * np.cos(2 * a - 2.6), 0.0)
+    shift = offset(0.01 * np.sin(a), -0.06 + 0.03 * gain * np.cos(2 * a - 2.6), 0.0)
     heading = carry(p, t, path, shift=shift, turns=[("y", -0.16 * gain * np.cos(a)), ("x", 0.14)])
     p.turn("spine", ("y", 0.2 * gain * np.cos(a)), ("x", 0.05))
     p.turn("chest", ("y", 0.16 * gain * np.cos(a)))
@@ -294,7 +294,7 @@ CLIPS = {
     "walk": (1.1, walk),
     "run": (0.9, run),
     "twist": (1.1, twist),
-    "squat": (1.1, squat),
+    "squat": (1.4, squat),
     "wave": (1.2, wave),
     "kick": (1.0, kick),
     "spin": (1.2, spin),

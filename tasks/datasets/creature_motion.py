@@ -78,6 +78,12 @@ def footfalls(
     return foot, fraction
 
 
+def raised(target: np.ndarray, pitch: np.ndarray, toe: float, heel: float) -> np.ndarray:
+    """Foot targets lifted so that a foot pitched on its ball (> 0) or heel (< 0) stays above the ground; metres."""
+    sine = np.sin(pitch)
+    return target + offset(0.0, np.where(sine > 0, toe, heel) * sine**2, 0.0)
+
+
 def cyclic(fraction: np.ndarray, *knots: tuple[float, float]) -> np.ndarray:
     """Smooth periodic curve through (fraction of the cycle, value) knots, fractions rising within 0..1."""
     at, value = np.array([*knots, (knots[0][0] + 1.0, knots[0][1])]).T

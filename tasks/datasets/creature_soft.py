@@ -104,7 +104,7 @@ def lobe_masses(soft: Lobe, nearest: np.ndarray, vertices: np.ndarray, weights: 
     rest = soft.chain()
     n = np.arange(soft.count)
     springs = np.concatenate([np.stack([n[:-1], n[1:]], 1), np.stack([n[:-2], n[2:]], 1)])
-    stretch = TAU * np.repeat([12.0, soft.bend], [soft.count - 1, soft.count - 2])
+    stretch = TAU * np.repeat([20.0, soft.bend], [soft.count - 1, soft.count - 2])
     length = np.linalg.norm(rest[springs[:, 0]] - rest[springs[:, 1]], axis=1)
     if soft.heavy:
         carried = np.concatenate([soft.count - n[1:], np.zeros(soft.count - 2)])
@@ -225,7 +225,7 @@ def cloth_masses(
         stretch=stretch,
         drag=0.8,
         avoid=soft.avoid,
-        margin=bell.half + 0.01,
+        margin=bell.half + 0.028,
     )
 
 

@@ -7,10 +7,9 @@ config answers at once, before torch or Prefect are imported.
 from __future__ import annotations
 
 import itertools
-import re
-from collections.abc import Iterable
+from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
+from functools import cache
 
 from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -25,6 +24,8 @@ from tasks.errors import InputError
 
 CONF = ROOT / "conf"
 NO_ABLATION = "none"
+ADDED = ("experiment", "ablation")  # groups that the config does not choose from by itself: +GROUP=CHOICE
+SWEPT = ("datasets", "methods", "ablations")
 
 
 @dataclass(frozen=True)
@@ -55,101 +56,111 @@ def headline(group: str, choice: str) -> str:
 
 def expand(overrides: list[str], multirun: bool = False) -> list[Case]:
     """All cases of a command line. Raises InputError for a wrong key, type or choice."""
-    parsed = _parse(overrides)
+    parsed = [_parse(text) for text in overrides]
     sweeps = [o for o in parsed if o.is_sweep_override()]
     if sweeps and not multirun:
         name = sweeps[0].key_or_group
         raise InputError(name, expected="one value", found=sweeps[0].input_line, do="add -m to run all of them")
-    fixed = [o.input_line for o in parsed if not o.is_sweep_override()]
-    axes = [[f"{_plus(o)}{o.key_or_group}={v}" for v in o.sweep_string_iterator()] for o in sweeps]
-    cases = [case for point in itertools.product(*axes) for case in _sweep(fixed, list(point))]
+    axes = [[_parse(f"{_plus(o)}{o.key_or_group}={v}") for v in o.sweep_string_iterator()] for o in sweeps]
+    fixed = [o for o in parsed if not o.is_sweep_override()]
+    compose_once = cache(_compose)
+    used: set[str] = set()
+    cases = [c for point in itertools.product(*axes) for c in _sweep([*fixed, *point], list(point), compose_once, used)]
+    for override in (*fixed, *itertools.chain(*axes)):
+        if override.input_line not in used:
+            raise _nowhere(override, cases)
     return list({(c.dataset, c.method, c.variant, str(c.config)): c for c in cases}.values())
 
 
-def _sweep(fixed: list[str], point: list[str]) -> Iterable[Case]:
-    """The cases of one point of a multirun: the experiment's datasets x methods x ablations."""
-    base = _compose([*fixed, *point])
-    label = ",".join(p.lstrip("+") for p in point if not p.startswith("seed="))
-    sweep = schema.check(dict(_plain(base).get("sweep") or {}), dict.fromkeys(_SWEEP, list[str] | None), "sweep.")
-    for dataset, method, ablation in itertools.product(*(sweep[n] or [None] for n in _SWEEP)):
-        chosen = [f"dataset={dataset}"] if dataset else []
-        chosen += [f"method={method}"] if method else []
+def _sweep(overrides: list[Override], point: list[Override], compose_once, used: set[str]) -> Iterator[Case]:
+    """The cases of one point of a multirun: the experiment's datasets x methods x ablations.
+
+    A key that only some of the methods or datasets have is set in those; used collects what was set anywhere.
+    """
+    choices = {o.key_or_group: str(o.value()) for o in overrides if o.key_or_group in groups()}
+    values = [o for o in overrides if o.key_or_group not in choices]
+    used |= {o.input_line for o in overrides if o.key_or_group in choices}
+    base, set_here = _set(compose_once(_group_overrides(choices)), values)
+    used |= {text for text in set_here if text.startswith("sweep.")}
+    sweep = schema.check(_plain(base)["sweep"], dict.fromkeys(SWEPT, list[str] | None), "sweep.")
+    label = ",".join(o.input_line.lstrip("+") for o in point if o.key_or_group != "seed")
+    for dataset, method, ablation in itertools.product(*(sweep[axis] or [None] for axis in SWEPT)):
+        chosen = {"dataset": dataset, "method": method} | choices  # what the user typed wins over the experiment
         if ablation and ablation != NO_ABLATION:
-            chosen.append(f"+ablation=[{','.join(ablation.split('+'))}]")
-        # what the user typed comes last, so that it wins over the experiment's grid
-        kept = [o for o in (*fixed, *point) if not (dataset and o.startswith("dataset="))]
-        kept = [o for o in kept if not (method and o.startswith("method="))]
-        kept.sort(key=lambda o: not o.startswith("+experiment="))  # stable: the experiment first, so that all else wins
-        first = sum(o.startswith("+experiment=") for o in kept)
-        config = _plain(_compose([*kept[:first], *chosen, *kept[first:]])) if chosen else _plain(base)
+            chosen["ablation"] = f"[{','.join(ablation.split('+'))}]"
+        composed, set_here = _set(compose_once(_group_overrides(chosen)), values)
+        used |= set_here
+        config = _plain(composed)
         config = schema.check(config, schema.schema(config))
         variant = ",".join(filter(None, [ablation, label])) or NO_ABLATION
-        yield Case(dataset or config["dataset"]["kind"], config["animate"]["name"], variant, config)
+        yield Case(chosen["dataset"] or config["dataset"]["kind"], config["animate"]["name"], variant, config)
 
 
-_SWEEP = ("datasets", "methods", "ablations")
+def _group_overrides(chosen: dict[str, str | None]) -> tuple[str, ...]:
+    """Choices of groups as Hydra's overrides; the experiment comes first, so that all else wins over it."""
+    present = {group: choice for group, choice in chosen.items() if choice is not None}
+    order = sorted(present, key=lambda group: group != "experiment")
+    return tuple(f"{'+' if group in ADDED else ''}{group}={present[group]}" for group in order)
 
 
-def _parse(overrides: list[str]) -> list[Override]:
+def _set(config: DictConfig, values: list[Override]) -> tuple[DictConfig, set[str]]:
+    """A copy of the config with the values set whose keys it has, and which those were."""
+    config = config.copy()
+    done = set()
+    for override in values:
+        parent, _, name = override.key_or_group.rpartition(".")
+        node = OmegaConf.select(config, parent) if parent else config
+        if isinstance(node, DictConfig) and name in node:
+            OmegaConf.update(config, override.key_or_group, override.value(), merge=False)
+            done.add(override.input_line)
+    return config, done
+
+
+def _nowhere(override: Override, cases: list[Case]) -> InputError:
+    """The error for a key that no case has: the first part of it that is wrong, and what would be right there."""
+    configs = [case.config for case in cases]
+    parts = override.key_or_group.split(".")
+    for depth, part in enumerate(parts):
+        inside = [c for c in configs if isinstance(c, dict)]
+        if not any(part in c for c in inside):
+            valid = dict.fromkeys(key for c in inside for key in c)
+            return schema.unknown_key(".".join(parts[: depth + 1]), [str(key) for key in valid])
+        configs = [c[part] for c in inside if part in c]
+    return InputError(override.key_or_group, expected="a key of the config", found=override.input_line)
+
+
+def _parse(text: str) -> Override:
     known = groups()
-    parser = OverridesParser.create()
-    parsed = []
-    for text in overrides:
-        try:
-            override = parser.parse_override(text)
-        except HydraException as error:
-            raise InputError(text, expected="KEY=VALUE", found=_first_line(error)) from None
-        parsed.append(override)
-        group = override.key_or_group.split("@")[0]
-        if group in known and not override.is_sweep_override() and isinstance(override.value(), str):
-            _check_choice(group, str(override.value()), known[group])
-    return parsed
+    try:
+        override = OverridesParser.create().parse_override(text)
+    except HydraException as error:
+        raise InputError(text, expected="KEY=VALUE", found=_first_line(error)) from None
+    name = override.key_or_group
+    if name in ADDED and not override.is_add():
+        raise InputError(text, expected=f"+{text}", found=text, do="an experiment or ablation is added with a plus")
+    if override.is_delete() or (override.is_add() and name not in ADDED):
+        raise InputError(text, expected=f"{name}=…", found=text, do="leave out the sign in front, no key can be added")
+    if name in known and not override.is_sweep_override():
+        _check_choices(name, str(override.value()), known[name])
+    return override
 
 
-def _check_choice(group: str, choice: str, valid: list[str]) -> None:
-    if choice not in valid:
-        raise InputError(group, expected=f"one of {', '.join(valid)}", found=repr(choice))
+def _check_choices(group: str, choice: str, valid: list[str]) -> None:
+    for one in choice.strip("[]").split(","):
+        if one.strip(" '") not in valid:
+            raise InputError(group, expected=f"one of {', '.join(valid)}", found=repr(one))
 
 
-def _compose(overrides: list[str]) -> DictConfig:
+def _compose(overrides: tuple[str, ...]) -> DictConfig:
     known = groups()
-    for text in overrides:  # sweeps are strings only here, so their choices are checked now
+    for text in overrides:  # the choices of an experiment's own grid are checked here, the user's were before
         group, _, choice = text.lstrip("+").partition("=")
-        if group in known and not choice.startswith("["):
-            _check_choice(group, choice, known[group])
-    needs_plus = ("ablation", "experiment")
-    for text in overrides:
-        if text.split("=")[0] in needs_plus:
-            raise InputError(text, expected=f"+{text}", found=text, do="an experiment or ablation is added with a plus")
+        _check_choices(group, choice, known[group])
     try:
         with initialize_config_dir(str(CONF), version_base="1.3"):
-            return compose("config", overrides)
-    except HydraException as error:
-        raise _explain(error, overrides) from None
-    except OmegaConfBaseException as error:
-        raise InputError("config", expected="values that fit together", found=_first_line(error)) from None
-
-
-def _explain(error: Exception, overrides: list[str]) -> InputError:
-    """Hydra's several lines about an override as one, with the keys that would have been right."""
-    text = str(error)
-    found = re.search(r"Could not (?:override|append to config\. An item is already at) '([\w.@/]+)'", text)
-    if not found:
-        return InputError("config", expected="a config that composes", found=_first_line(error))
-    key = found.group(1).rstrip(".")
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        names = {o.partition("=")[0].lstrip("+") for o in overrides}
-        whole_groups = [o for o in overrides if o.partition("=")[0].lstrip("+") in groups()]
-        config = compose("config", whole_groups if names & set(groups()) else [])
-    if "already at" in text:
-        return InputError(key, expected=f"{key}=…", found=f"+{key}=…", do="leave out the plus, the key exists")
-    parts = key.split(".")
-    for depth in range(len(parts)):
-        parent = ".".join(parts[:depth])
-        node = OmegaConf.select(config, parent) if parent else config
-        if isinstance(node, DictConfig) and parts[depth] not in node:
-            return schema.unknown_key(".".join(parts[: depth + 1]), [str(k) for k in node])
-    return InputError(key, expected="a key of the config", found=_first_line(error))
+            return compose("config", list(overrides))
+    except (HydraException, OmegaConfBaseException) as error:
+        raise InputError("config", expected="a config that composes", found=_first_line(error)) from None
 
 
 def _plain(config: DictConfig) -> dict:
@@ -170,8 +181,3 @@ def _first_line(error: Exception) -> str:
 def to_yaml(case: Case) -> str:
     """A case's config as YAML, for ``--cfg``."""
     return OmegaConf.to_yaml(OmegaConf.create(case.config))
-
-
-def repository_path(path: str) -> Path:
-    """A path of the config: absolute, or relative to where the command runs."""
-    return Path(path).expanduser()

@@ -17,16 +17,21 @@ LIVELY = 0.5  # of the median clip's movement: below this a clip is not chosen a
 LANDMARKS = 16  # points compared first when looking for equal frames
 
 
-def split(motion: Motion, *, by: Literal["clips", "frames"], test: list[str], fraction: float) -> tuple[Motion, Motion]:
+def split(
+    motion: Motion, *, by: Literal["auto", "clips", "frames"], test: list[str], fraction: float
+) -> tuple[Motion, Motion]:
     """(train, test), each contiguous run of frames a clip of its own, so that no window crosses a cut.
 
     by="clips": the clips named in `test`; when it is empty, :func:`choose_clips` picks about `fraction` of them.
     by="frames": the last `fraction` of every clip; `test` must be empty.
+    by="auto": clips where there are several or some are named, else frames.
 
     Frames at which the test repeats a training frame (clips often start from one neutral pose) are left out of the
     test. Raises InputError when that takes more than half of a test clip (by="frames": of all test frames), when either
     side has no frames, and for unknown names.
     """
+    if by == "auto":
+        by = "clips" if test or len(motion.clip_names) > 1 else "frames"
     if by == "clips":
         train, held = _by_clips(motion, test, fraction)
     else:

@@ -158,3 +158,9 @@ def test_least_deformed_is_the_frame_in_the_middle_of_a_stretch(faces):
     points = (np.array([2.0, 1.25, 1.0, 1.8, 1.1])[:, None, None] * shape).astype(np.float32)
     motion = Motion("stretch", points, faces, np.array([0, 5]), ("stretch",), 24.0)
     assert canonical(motion, choice="least_deformed").frame == 1
+
+
+def test_auto_takes_clips_where_there_are_several():
+    several, one = random_motion([5, 6, 7]), random_motion([10])
+    assert split(several, by="auto", test=[], fraction=0.3)[1].clip_names in [("clip0",), ("clip1",), ("clip2",)]
+    assert split(one, by="auto", test=[], fraction=0.2)[1].frames == 2

@@ -60,8 +60,10 @@ def one_line(error: InputError) -> str:
         (["method=nope"], ["method", "partmm", "fullmm", "'nope'"]),
         (["+experiment=nope"], ["experiment", "quick", "table3", "'nope'"]),
         (["experiment=table3"], ["+experiment=table3"]),
-        (["+bones.max_bones=3"], ["bones.max_bones", "leave out the plus"]),
-        (["+bones.extra=3"], ["bones.extra", "max_bones"]),
+        (["+bones.max_bones=3"], ["bones.max_bones", "leave out the sign"]),
+        (["~bones.max_bones"], ["bones.max_bones", "leave out the sign"]),
+        (["bones.extra=3"], ["bones.extra", "max_bones"]),
+        (["method=lbs", "animate.k=3"], ["animate.k", "function"]),
         (["bones"], ["bones", "KEY=VALUE"]),
         (["bones.max_bones="], ["bones.max_bones"]),
         (["bones.max_bones=1,2"], ["bones.max_bones", "add -m"]),
@@ -99,6 +101,11 @@ def test_seeds_are_not_variants():
 def test_what_the_user_types_wins_over_the_experiment():
     cases = config.expand(["+experiment=ablation_matching", "animate.patch=5"])
     assert all(c.config["animate"]["patch"] == 5 for c in cases)
+
+
+def test_a_key_that_only_some_methods_have_is_set_in_those():
+    cases = config.expand(["animate.k=3"])
+    assert {c.method: c.config["animate"].get("k") for c in cases} == {"lbs": None, "fullmm": 3, "partmm": 3}
 
 
 def test_a_dataset_on_the_command_line_replaces_the_experiments():

@@ -110,7 +110,7 @@ def _set(config: DictConfig, values: list[Override]) -> tuple[DictConfig, set[st
     for override in values:
         parent, _, name = override.key_or_group.rpartition(".")
         node = OmegaConf.select(config, parent) if parent else config
-        if isinstance(node, DictConfig) and name in node:
+        if isinstance(node, DictConfig) and name in node.keys():  # noqa: SIM118, "in node" skips keys still to be given
             OmegaConf.update(config, override.key_or_group, override.value(), merge=False)
             done.add(override.input_line)
     return config, done

@@ -12,8 +12,7 @@ from scipy.spatial import cKDTree
 from tasks.evaluation import plot, render
 from tasks.evaluation.colours import CLAY, bone_colours, error_map, part_colours, weight_map
 from tasks.evaluation.metrics import frame_rmse, squared_errors, unit_of
-from tasks.geometry import measure, rigid
-from tasks.geometry.rotations import geodesic
+from tasks.geometry import measure
 from tasks.values import Canonical, Clusters, Motion, Parts, Skeleton, Skinning
 
 PANEL_HEIGHT = 380  # of one picture in a figure, in pixels
@@ -47,31 +46,15 @@ def shape_of(points: np.ndarray, faces: np.ndarray | None) -> Shape:
     return Shape(None, 0.75 * float(np.median(near[:, -1])) or 0.01 * measure.diagonal(points))
 
 
-@dataclass(frozen=True)
-class View:
-    """How all pictures of a subject are taken. azimuth: of the eye in radians; upright: (3, 3) turns canonical points
-    the way the motion stands (files may keep their rest shape lying down)."""
-
-    azimuth: float
-    upright: np.ndarray
-
-    def stand(self, points: np.ndarray) -> np.ndarray:
-        """Canonical points (N, 3), turned upright."""
-        return points @ self.upright.T
-
-
-def view_of(motion: Motion, canonical: Canonical) -> View:
-    """Looks at the shape's broad side, and from the front where it travels."""
+def azimuth_of(motion: Motion) -> float:
+    """Where all pictures of a subject are taken from: its broad side, and the front where it travels. In radians."""
     first = motion.clips()[0]
     start = motion.points[first.start]
     azimuth = render.broadside(start)
     travel = motion.points[first.stop - 1].mean(0) - start.mean(0)
     towards_eye = travel[0] * np.sin(azimuth) + travel[2] * np.cos(azimuth)
-    if towards_eye < 0 and np.hypot(travel[0], travel[2]) > 0.2 * measure.diagonal(start):
-        azimuth += np.pi
-    turn = rigid.procrustes(canonical.points, start)[:, :3]
-    lies = geodesic(turn, np.eye(3)) > np.pi / 4
-    return View(azimuth, turn if lies else np.eye(3))
+    away = towards_eye < 0 and np.hypot(travel[0], travel[2]) > 0.2 * measure.diagonal(start)
+    return azimuth + np.pi if away else azimuth
 
 
 def error_figure(
@@ -80,7 +63,7 @@ def error_figure(
     diagonal: float,
     *,
     focus: str,
-    view: View,
+    azimuth: float,
     theme: str = "light",
 ) -> np.ndarray:
     """Truth and methods side by side, coloured by vertex error on one scale, in the median and the worst frame.
@@ -96,7 +79,7 @@ def error_figure(
     frames = list(chosen.values())
     errors = {name: factor * np.sqrt(squared_errors(p[frames], test.points[frames])) for name, p in results.items()}
     top = plot.round_up(float(np.quantile(np.stack(list(errors.values())), 0.99)), (1, 1.5, 2, 3, 4, 5, 6, 8, 10))
-    cameras = _cameras(test.points[frames], view.azimuth)
+    cameras = _cameras(test.points[frames], azimuth)
     shape = shape_of(test.points[0], test.faces)
     rows = []
     for i, (rank, frame) in enumerate(chosen.items()):
@@ -114,7 +97,7 @@ def error_figure(
 
 
 def skeleton_figure(
-    canonical: Canonical, skeleton: Skeleton, parts: Parts | None, *, view: View, theme: str = "light"
+    canonical: Canonical, skeleton: Skeleton, parts: Parts | None, *, azimuth: float, theme: str = "light"
 ) -> np.ndarray:
     """The skeleton inside the translucent shape, from two sides; joints in the colour of their part, the root white."""
     shape = shape_of(canonical.points, canonical.faces)
@@ -122,11 +105,10 @@ def skeleton_figure(
     lines = [f"{len(skeleton.parents)} joints"] if parts is None else []
 
     def joints(canvas: np.ndarray, camera: render.Camera) -> None:
-        inner = view.stand(skeleton.joints)
-        render.paint_skeleton(canvas, camera, inner, skeleton.parents, colours, size=9, theme=theme)
+        render.paint_skeleton(canvas, camera, skeleton.joints, skeleton.parents, colours, size=9, theme=theme)
 
-    points = view.stand(canonical.points)
-    sides = [_cameras(points[None], view.azimuth + turn)[0] for turn in (0.0, 0.5 * np.pi)]
+    points = canonical.points
+    sides = [_cameras(points[None], azimuth + turn)[0] for turn in (0.0, 0.5 * np.pi)]
     glass = {"opacity": 0.16, "rim": 0.5}
     pictures = [_panel(shape, side, points, CLAY * 0.9, lines, theme, joints, **glass) for side in sides]
     if parts is None:
@@ -137,13 +119,13 @@ def skeleton_figure(
 
 
 def parts_figure(
-    canonical: Canonical, skinning: Skinning, parts: Parts, *, view: View, theme: str = "light"
+    canonical: Canonical, skinning: Skinning, parts: Parts, *, azimuth: float, theme: str = "light"
 ) -> np.ndarray:
     """How much each point follows each part, W affinity^T: all parts in their colours, then each part by itself."""
     shape = shape_of(canonical.points, canonical.faces)
     follow = skinning.weights.astype(np.float32) @ parts.affinity.astype(np.float32).T  # (N, P)
-    points = view.stand(canonical.points)
-    camera = _cameras(points[None], view.azimuth)[0]
+    points = canonical.points
+    camera = _cameras(points[None], azimuth)[0]
     colours = part_colours(len(parts.names))
     pictures = [_panel(shape, camera, points, follow @ colours, ["all parts"], theme)]
     for p, name in enumerate(parts.names):
@@ -152,13 +134,13 @@ def parts_figure(
     return render.finish(_grid(pictures, 3, theme))
 
 
-def bones_figure(canonical: Canonical, skinning: Skinning, *, view: View, theme: str = "light") -> np.ndarray:
+def bones_figure(canonical: Canonical, skinning: Skinning, *, azimuth: float, theme: str = "light") -> np.ndarray:
     """The bones' weights as mixed colours, from two sides, and the number of bones that share a point."""
     shape = shape_of(canonical.points, canonical.faces)
     weights = skinning.weights.astype(np.float32)
     shared = 1.0 / np.maximum((weights**2).sum(1), 1e-9)  # 1 where one bone rules, 4 where four have equal shares
-    points = view.stand(canonical.points)
-    front, back = (_cameras(points[None], view.azimuth + turn)[0] for turn in (0.0, np.pi))
+    points = canonical.points
+    front, back = (_cameras(points[None], azimuth + turn)[0] for turn in (0.0, np.pi))
     mixed = weights @ bone_colours(weights.shape[1])
     count = f"{weights.shape[1]} bones"
     pictures = [

@@ -11,26 +11,26 @@ def error_picture(test: Motion, canonical: Canonical, animations: dict[str, Anim
     """Truth and methods side by side, coloured by vertex error, in the median and the worst frame of ``focus``."""
     shown = {label: animation.points for label, animation in animations.items()}
     diagonal = measure.diagonal(canonical.points)
-    pixels = figures.error_figure(test, shown, diagonal, focus=focus, view=figures.view_of(test, canonical))
+    pixels = figures.error_figure(test, shown, diagonal, focus=focus, azimuth=figures.azimuth_of(test))
     caption = f"{test.name}: vertex error on unseen clips, median and worst frame of {focus}"
     return Picture("errors", caption, pixels)
 
 
 def skeleton_picture(train: Motion, canonical: Canonical, skeleton: Skeleton, parts: Parts) -> Picture:
     """The skeleton inside the canonical shape, joints in the colour of their part."""
-    pixels = figures.skeleton_figure(canonical, skeleton, parts, view=figures.view_of(train, canonical))
+    pixels = figures.skeleton_figure(canonical, skeleton, parts, azimuth=figures.azimuth_of(train))
     return Picture("skeleton", f"{train.name}: inner skeleton, joints in the colour of their part", pixels)
 
 
 def parts_picture(train: Motion, canonical: Canonical, skinning: Skinning, parts: Parts) -> Picture:
     """How much each point follows each part."""
-    pixels = figures.parts_figure(canonical, skinning, parts, view=figures.view_of(train, canonical))
+    pixels = figures.parts_figure(canonical, skinning, parts, azimuth=figures.azimuth_of(train))
     return Picture("parts", f"{train.name}: overlapping parts, matched on their own", pixels)
 
 
 def bones_picture(train: Motion, canonical: Canonical, skinning: Skinning) -> Picture:
     """The free-form bones' weights."""
-    pixels = figures.bones_figure(canonical, skinning, view=figures.view_of(train, canonical))
+    pixels = figures.bones_figure(canonical, skinning, azimuth=figures.azimuth_of(train))
     return Picture("bones", f"{train.name}: skin weights of the free-form bones", pixels)
 
 

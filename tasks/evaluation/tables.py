@@ -72,6 +72,14 @@ class Table:
     notes: tuple[str, ...] = ()
 
     @property
+    def remarks(self) -> list[str]:
+        """The notes, and how to read marks and spreads where there are any."""
+        cells = [cell for column in self.columns for cell in column.cells]
+        ranked = "Best in bold, second best underlined, ranked before rounding." if any(c.rank for c in cells) else ""
+        seeds = "± is the standard deviation over seeds." if any(c.spread is not None for c in cells) else ""
+        return [text for text in (*self.notes, ranked, seeds) if text]
+
+    @property
     def footnotes(self) -> list[str]:
         """The cells' notes, each once, in reading order; a cell's mark is its note's place in here, from 1."""
         cells = (column.cells[r] for r in range(len(self.rows)) for column in self.columns)
@@ -93,8 +101,8 @@ def build(
 ) -> Table:
     """The table of some metrics over all methods and subjects.
 
-    rows: as in metrics.csv; metrics: the columns of each subject, the first also shown as a gain over the first of the
-    methods ``baselines`` that the column holds; labels: what to call methods, "method/variant"s, datasets and
+    rows: as in metrics.csv; metrics: the columns of each subject, the first it has also shown as a gain over the first
+    of the methods ``baselines`` that the column holds; labels: what to call methods, "method/variant"s, datasets and
     "dataset/subject"s, methods in the order wanted; data_status: "paper" or "substitute" by dataset or
     "dataset/subject" (substitute where not named); stands_for: the paper's column that a subject takes the place of,
     "dataset/subject" to "dataset/subject"; notes: remarks under the table. With ``paper``, the cells of its table
@@ -115,7 +123,8 @@ def build(
                 columns += _columns(group, metric, status, _in_order(ours, names), _in_order(theirs, names))
     for (dataset, subject, metric), theirs in printed.items():
         columns.append(_column(_group(dataset, subject), metric, "paper", "printed", _in_order(theirs, names)))
-    columns = [_with_gains(c, names, baselines) if c.metric == metrics[0] else c for c in columns]
+    first = {c.group: c.metric for c in reversed(columns)}  # of each subject's metrics
+    columns = [_with_gains(c, names, baselines) if c.metric == first[c.group] else c for c in columns]
     called = {**(paper.methods if paper else {}), **(paper.columns if paper else {}), **labels}
     against = " or ".join(dict.fromkeys(called.get(c.baseline, c.baseline) for c in columns if c.baseline))
     return Table(

@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     import rich.console
     import rich.table
 
-LEGEND = "Best in bold, second best underlined, ranked before rounding; ± is the standard deviation over seeds."
-
 
 def number(value: float, digits: int, *, signed: bool = False) -> str:
     """A number with a true minus sign, and a plus where it is a difference; no sign on what rounds to nothing."""
@@ -57,7 +55,7 @@ def markdown(table: Table) -> str:
     lines += [[label, *(show(c, c.cells[r]) for c in table.columns)] for r, label in enumerate(table.rows)]
     grid = "\n".join("| " + " | ".join(text.replace("|", "\\|") for text in line) + " |" for line in lines)
     marks = [f"<sup>{i}</sup> {note}." for i, note in enumerate(footnotes, start=1)]
-    return "\n\n".join([f"**{table.title}**", grid, *table.notes, *marks, LEGEND]) + "\n"
+    return "\n\n".join([f"**{table.title}**", grid, *table.remarks, *marks]) + "\n"
 
 
 _LATEX = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
@@ -91,7 +89,7 @@ def latex(table: Table) -> str:
     parts = [r"\begin{table}", r"\centering", r"\small", rf"\caption{{{text(table.title)}}}"]
     parts += [rf"\begin{{tabular}}{{l{'r' * len(table.columns)}}}", r"\toprule", head, " ".join(rules), names, data]
     parts += [r"\midrule", *rest, r"\bottomrule", r"\end{tabular}", "", r"\smallskip", r"\footnotesize"]
-    notes = [*(text(note) for note in table.notes), *marks, text(LEGEND)]
+    notes = [*(text(note) for note in table.remarks), *marks]
     return "\n".join([*parts, r" \\ ".join(notes), r"\end{table}"]) + "\n"
 
 
@@ -118,13 +116,12 @@ _HTML = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_
 </table>
 </div>
 <div class="notes">
-{% for note in table.notes %}
+{% for note in table.remarks %}
 <p>{{ note }}</p>
 {% endfor %}
 {% for note in footnotes %}
 <p><sup>{{ loop.index }}</sup> {{ note }}.</p>
 {% endfor %}
-<p>{{ legend }}</p>
 </div>
 </figure>
 """
@@ -143,7 +140,7 @@ def html(table: Table) -> str:
         return Markup(tag).format(escape(main)) + after + mark
 
     groups = [(group, list(columns)) for group, columns in groupby(table.columns, key=lambda c: c.group)]
-    return _HTML.render(table=table, groups=groups, show=show, data_text=data_text, footnotes=footnotes, legend=LEGEND)
+    return _HTML.render(table=table, groups=groups, show=show, data_text=data_text, footnotes=footnotes)
 
 
 def terminal(table: Table) -> rich.console.Group:
@@ -153,7 +150,7 @@ def terminal(table: Table) -> rich.console.Group:
     from rich.text import Text
 
     footnotes = table.footnotes
-    notes = [*table.notes, *(f"[{i}] {note}." for i, note in enumerate(footnotes, start=1)), LEGEND]
+    notes = [*table.remarks, *(f"[{i}] {note}." for i, note in enumerate(footnotes, start=1))]
     measured = {column.group for column in table.columns if column.kind == "ours"}
     grids: dict[str, list[Column]] = {}
     for column in table.columns:

@@ -131,6 +131,21 @@ def test_rows_come_in_the_order_of_labels_then_of_the_paper(config):
     assert made.rows == ("LBS", "Robust LBS", "MLP", "GRU", "FullMM", "PartMM", "PartMM, 3 neighbours", "mine")
 
 
+def test_gains_are_shown_on_the_first_metric_that_a_subject_has():
+    rows = [row("lbs", 2.0, metric="rmse_pct", unit="%"), row("partmm", 1.0, metric="rmse_pct", unit="%")]
+    rows += [row("lbs", 4.0), row("partmm", 2.0), row("lbs", 4.0, subject="cat"), row("partmm", 1.0, subject="cat")]
+    made = table(rows, metrics=["rmse_pct", "rmse"], baselines=["lbs"])
+    assert column(made, "horse", "ours", "rmse_pct").cells[1].gain == -50
+    assert column(made, "horse", "ours", "rmse").cells[1].gain is None
+    assert column(made, "cat", "ours", "rmse").cells[1].gain == -75
+
+
+def test_remarks_explain_only_what_there_is():
+    assert table([row("a", 1.0)]).remarks == []
+    assert len(table([row("a", 1.0), row("b", 2.0)]).remarks) == 1
+    assert len(table([row("a", 1.0), row("b", 2.0), row("b", 2.5, seed=1)]).remarks) == 2
+
+
 def test_decimals():
     assert digits_for([17.41, 3.2], "rmse") == 1
     assert digits_for([0.03412], "rmse") == 4

@@ -39,7 +39,7 @@ def _bend(rest: np.ndarray, t: float) -> np.ndarray:
         amount = np.clip((rest[:, 2] - pivot) / 0.1 + 0.5, 0, 1) * angle
         y, z = out[:, 1], out[:, 2] - pivot
         out[:, 1], out[:, 2] = y * np.cos(amount) - z * np.sin(amount), y * np.sin(amount) + z * np.cos(amount) + pivot
-    return out + [0.1 * np.sin(t), 0.0, 0.02 * t]
+    return out + np.array([0.1 * np.sin(t), 0.0, 0.02 * t])
 
 
 @pytest.fixture(scope="session")

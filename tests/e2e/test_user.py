@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from tasks.evaluation.rows import COLUMNS
 from tests.e2e.conftest import Run
 
 pytestmark = pytest.mark.slow
@@ -38,7 +39,7 @@ def test_table_files_cache_and_change_of_one_setting(user, worm_file):
     assert len(list((report / "figures").iterdir())) == 5
 
     rows = pd.read_csv(report / "metrics.csv", keep_default_na=False)
-    assert list(rows) == "experiment dataset subject method variant metric value unit seed key".split()
+    assert tuple(rows) == COLUMNS
     assert set(rows["method"]) == {"lbs", "fullmm", "partmm"}
     values = rows.set_index(["method", "metric"])["value"]
     for method in ("lbs", "fullmm", "partmm"):

@@ -15,7 +15,7 @@ from tasks.evaluation.metrics import frame_rmse, squared_errors, unit_of
 from tasks.geometry import measure
 from tasks.values import Canonical, Clusters, Motion, Parts, Skeleton, Skinning
 
-PANEL_HEIGHT = 380  # of one picture in a figure, in pixels
+PICTURE = 330  # side of a square picture in a figure, in pixels; others have its area
 ELEVATION = 0.18
 EYE = 5.0  # the eye's distance in bounding radii
 CAPTION = 30  # height of a line of text under a picture
@@ -71,8 +71,7 @@ def error_figure(
     results: label -> (F, N, 3) on the frames of ``test``; diagonal: of the canonical bounding box; focus: the label
     whose frames are ranked. The scale ends at the 99th percentile of the errors shown, rounded up.
     """
-    order = np.argsort(frame_rmse(results[focus], test.points), kind="stable")
-    chosen = {"median": int(order[len(order) // 2]), "worst": int(order[-1])}
+    chosen = _chosen_frames(test, results[focus])
     unit, factor = unit_of("length", test.unit)
     if unit == "unit":  # says nothing by itself
         unit, factor = "% of diagonal", 100.0 / diagonal
@@ -94,6 +93,33 @@ def error_figure(
         rows.append(np.hstack(row))
     sheet = np.vstack(rows)
     return render.finish(np.hstack([sheet, _bar(len(sheet), error_map, top, unit, theme)]))
+
+
+def overlay_figure(
+    test: Motion, results: Mapping[str, np.ndarray], *, focus: str, azimuth: float, theme: str = "light"
+) -> np.ndarray:
+    """The truth as a glass over each method's result, in the median and the worst frame of ``focus``.
+
+    results: label -> (F, N, 3) on the frames of ``test``. Where the two agree, only the colour is mixed.
+    """
+    chosen = _chosen_frames(test, results[focus])
+    cameras = _cameras(test.points[list(chosen.values())], azimuth)
+    shape = shape_of(test.points[0], test.faces)
+    tint = part_colours(2)
+    rows = []
+    for camera, (rank, frame) in zip(cameras, chosen.items(), strict=True):
+        row = []
+        for name, points in results.items():
+
+            def made(canvas: np.ndarray, camera: render.Camera, points: np.ndarray = points[frame]) -> None:
+                shape.paint(canvas, camera, points, tint[1])
+
+            lines = [name, f"{rank} frame: {_place(test, frame)}"]
+            row.append(_panel(shape, camera, test.points[frame], tint[0], lines, theme, made, opacity=0.3, rim=0.4))
+        rows.append(np.hstack(row))
+    names = ["overlay", "result", "truth"]
+    legend = _legend(sum(len(row) for row in rows), names, [None, tint[1], tint[0]], theme)
+    return render.finish(np.hstack([np.vstack(rows), legend]))
 
 
 def skeleton_figure(
@@ -169,20 +195,20 @@ def history_figure(skinning: Skinning, diagonal: float) -> str:
 def _cameras(frames: np.ndarray, azimuth: float) -> list[render.Camera]:
     """One camera a frame: each centred on its frame, all of the scale and picture size that fit the largest.
 
-    Pictures are as high as ``PANEL_HEIGHT`` and as wide as the shapes ask for.
+    Pictures are as wide or high as the shapes ask for and all of one area.
     """
 
-    def look(points: np.ndarray, width: int) -> render.Camera:
-        size = {"width": width, "height": PANEL_HEIGHT, "distance": EYE, "margin": 0.05}
+    def look(points: np.ndarray, width: int, height: int) -> render.Camera:
+        size = {"width": width, "height": height, "distance": EYE, "margin": 0.05}
         return render.look(points, azimuth=azimuth, elevation=ELEVATION, **size)
 
     spans = []
     for points in frames:
-        camera = look(points, PANEL_HEIGHT)
+        camera = look(points, PICTURE, PICTURE)
         spans.append(np.ptp(camera.project(points)[0], axis=0) / camera.scale)
     across, up = np.max(spans, axis=0)
-    width = int(np.clip(PANEL_HEIGHT * across / up, 0.62 * PANEL_HEIGHT, 1.25 * PANEL_HEIGHT)) // 2 * 2
-    cameras = [look(points, width) for points in frames]
+    stretch = math.sqrt(np.clip(across / up, 0.6, 1.4))
+    cameras = [look(points, round(PICTURE * stretch), round(PICTURE / stretch)) for points in frames]
     widest = min(cameras, key=lambda c: c.scale)
     return [replace(c, scale=widest.scale, distance=widest.distance) for c in cameras]
 
@@ -205,7 +231,9 @@ def _panel(
     shape.paint(canvas, camera, points, colours, **glass)
     strip = render.blank(width, 8 + CAPTION * len(lines), theme) if lines else render.blank(width, 0, theme)
     for i, line in enumerate(lines):
-        render.text(strip, line, (width / 2, 18 + 24 * i), size=15, align="middle", bold=i == 0, theme=theme)
+        render.text(
+            strip, line, (width / 2, 18 + 24 * i), size=15, align="middle", bold=i == 0, theme=theme, room=width - 8
+        )
     return np.vstack([canvas, strip])
 
 
@@ -253,6 +281,11 @@ def _joint_colours(skeleton: Skeleton, parts: Parts | None) -> np.ndarray:
         return np.repeat(part_colours(1), len(skeleton.parents), 0)
     size = np.where(parts.joints, parts.joints.sum(1)[:, None], np.iinfo(np.int64).max)  # (P, J)
     return part_colours(len(parts.names))[size.argmin(0)]
+
+
+def _chosen_frames(test: Motion, points: np.ndarray) -> dict[str, int]:
+    order = np.argsort(frame_rmse(points, test.points), kind="stable")
+    return {"median": int(order[len(order) // 2]), "worst": int(order[-1])}
 
 
 def _place(motion: Motion, frame: int) -> str:

@@ -209,17 +209,21 @@ def text(
     align: str = "left",
     bold: bool = False,
     theme: str = "light",
-    fade: float = 0.0,
+    room: float = np.inf,
 ) -> None:
     """Writes a line. at: left end, middle or right end of its base line (``align``) in final pixels; size: in final
-    pixels; fade: 0 full ink .. 1 gone. Letters outside Latin-1 may be missing."""
+    pixels, less where the line would be wider than ``room``. Letters outside Latin-1 may be missing."""
     scale = size * SUPERSAMPLE / 30.0
     thick = max(1, round(scale * (2.2 if bold else 1.1)))
     (width, _), _ = cv2.getTextSize(words, cv2.FONT_HERSHEY_SIMPLEX, scale, thick)
+    if width > room * SUPERSAMPLE:
+        scale *= room * SUPERSAMPLE / width
+        (width, _), _ = cv2.getTextSize(words, cv2.FONT_HERSHEY_SIMPLEX, scale, thick)
     x = at[0] * SUPERSAMPLE - {"left": 0.0, "middle": width / 2, "right": width}[align]
-    colour = (1 - fade) * np.asarray(INK[theme]) + fade * np.asarray(PAPER[theme])
     where = (round(x), round(at[1] * SUPERSAMPLE))
-    cv2.putText(canvas, words, where, cv2.FONT_HERSHEY_SIMPLEX, scale, to_bytes(colour).tolist(), thick, cv2.LINE_AA)
+    cv2.putText(
+        canvas, words, where, cv2.FONT_HERSHEY_SIMPLEX, scale, to_bytes(INK[theme]).tolist(), thick, cv2.LINE_AA
+    )
 
 
 @njit(cache=True, nogil=True)

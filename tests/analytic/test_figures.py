@@ -252,6 +252,30 @@ def test_error_figure_colours_by_error_on_one_scale(walker):
     assert image.dtype == np.uint8
 
 
+def test_an_overlay_shows_both_shapes_where_they_differ(walker):
+    """Truth is blue glass over an orange result: off by a width, there is orange beside blue; on the spot, none is."""
+    motion, *_ = walker
+    off = motion.points + np.float32([1.2, 0, 0])
+
+    def orange_and_blue(points: np.ndarray) -> np.ndarray:
+        image = figures.overlay_figure(motion, {"it": points}, azimuth=np.pi, focus="it").astype(int)
+        warmth = image[:, :-150, 0] - image[:, :-150, 2]  # without the legend
+        return np.array([(warmth > 90).sum(), (warmth < -25).sum()])
+
+    apart, together = orange_and_blue(off), orange_and_blue(motion.points)
+    assert (apart > 500).all()
+    assert (apart > 5 * together).all()
+
+
+def test_a_line_of_text_shrinks_into_its_room():
+    wide, narrow = render.blank(200, 30), render.blank(200, 30)
+    render.text(wide, "a rather long name of a clip", (100, 20), align="middle")
+    render.text(narrow, "a rather long name of a clip", (100, 20), align="middle", room=60)
+    spans = [np.ptp(np.nonzero((c < 200).any((0, 2)))[0]) / render.SUPERSAMPLE for c in (wide, narrow)]
+    assert spans[0] > 100
+    assert 40 < spans[1] <= 62
+
+
 def test_figures_of_surfaces_and_of_bare_points(walker):
     motion, canonical, skinning, skeleton, parts = walker
     for faces in (canonical.faces, None):

@@ -7,7 +7,6 @@ the count of clusters in one go, from which the count is chosen.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -25,7 +24,7 @@ _COMPRESSION = 2e-3  # error allowed to the compressed paths, relative to the sh
 _SEED_POINTS = 12  # points a new cluster starts from
 _LEAST = 3  # points below which a cluster has no rigid motion of its own
 _POLISH = 8  # reassignments once the count is chosen
-_MOST_SPLITS = 60  # rounds of splitting, where clusters keep falling empty
+_PATIENCE = 4  # rounds of splitting without a new cluster, because small ones keep falling empty
 _CONSIDERABLE = 0.01  # part of the mean cluster's error below which a cluster is not split
 
 
@@ -53,10 +52,9 @@ def cluster(
     sample = np.sort(rng.choice(total, min(total, _SAMPLE), replace=False))
     extent = diagonal(canonical.points[sample])
     paths = compress(train.points, canonical.points, tolerance=_COMPRESSION * extent, sample=sample)
-    part = replace(paths, rest=paths.rest[sample], path=paths.path[sample])
-    part = replace(part, energy=_energy(part))
+    part = paths.take(sample)
     floor = exact * extent
-    labels = _split(part, max(min(max_bones, len(sample) // _LEAST), 1), rounds, floor)
+    labels = split(part, np.zeros(len(sample), np.int32), min(max_bones, len(sample) // _LEAST), rounds, floor)
     counts, errors, states = _merge_down(part, labels)
     if count == "auto":
         chosen = choose_count(counts, errors, len(sample), slack, floor)
@@ -77,10 +75,6 @@ def choose_count(counts: np.ndarray, errors: np.ndarray, points: int, slack: flo
     return int(np.argmax(good))
 
 
-def _energy(paths: Trajectories) -> float:
-    return float(np.sum(paths.path.astype(np.float64) ** 2))
-
-
 def _fit(part: Trajectories, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Sums K (B, 4, 4) and Y (B, 4, 3, F) of each cluster and its best rigid offsets (B, 4, 3, F)."""
     k, y = transforms.sums(part, labels[:, None], np.ones((len(labels), 1)), int(labels.max()) + 1)
@@ -88,19 +82,22 @@ def _fit(part: Trajectories, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return k, y, transforms.rigid_fit(k, y)[0]
 
 
-def _split(part: Trajectories, ceiling: int, rounds: int, floor: float) -> np.ndarray:
-    """Labels of at most `ceiling` clusters: all clusters with a considerable error are split in each round."""
-    labels = np.zeros(len(part.rest), np.int32)
-    near = (
-        cKDTree(part.rest[:, :3]).query(part.rest[:, :3], k=min(_SEED_POINTS, len(labels)))[1].reshape(len(labels), -1)
-    )
-    for _ in range(_MOST_SPLITS):
+def split(part: Trajectories, labels: np.ndarray, ceiling: int, rounds: int, floor: float) -> np.ndarray:
+    """Labels of at most `ceiling` clusters from fewer: all clusters with a considerable error are split at once.
+
+    labels: (N,) int32 in 0..B-1 to start from; rounds: reassignments after every split; floor: vertex RMSE at which
+    there is nothing left to split.
+    """
+    place = part.rest[:, :3]
+    near = cKDTree(place).query(place, k=min(_SEED_POINTS, len(labels)))[1].reshape(len(labels), -1)
+    most, stalled = 0, 0
+    while stalled < _PATIENCE:
         bones = weights.forms(part, _fit(part, labels)[2])
         found, error = weights.nearest_bone(part, bones)
         count = int(labels.max()) + 1
-        reached = part.alignment.scale * np.sqrt(error.mean())
-        if count >= ceiling or reached <= floor:
+        if count >= ceiling or part.alignment.scale * np.sqrt(error.mean()) <= floor:
             break
+        most, stalled = max(most, count), stalled + 1 if count <= most else 0
         labels = _compact(found)
         seeds = _seeds(part, labels, error, near, ceiling - int(labels.max()) - 1)
         for new, seed in enumerate(seeds, start=int(labels.max()) + 1):
@@ -158,7 +155,7 @@ def _merge_down(part: Trajectories, labels: np.ndarray) -> tuple[np.ndarray, np.
     cost = np.full((len(k), len(k)), np.inf)
     for b in range(len(k) - 1):
         _pair_costs(k, y, gain, b, np.arange(b + 1, len(k)), cost)
-    energy, current = _energy(part), labels.copy()
+    energy, current = part.squared, labels.copy()
     states, errors = [current.copy()], [part.rmse(energy + gain.sum())]
     for _ in range(len(k) - 1):
         a, b = np.unravel_index(np.argmin(cost), cost.shape)

@@ -6,14 +6,14 @@ import numpy as np
 
 from tasks.geometry import neighbours
 
+Graph = tuple[np.ndarray, np.ndarray, np.ndarray]  # indptr (N + 1,), indices, shares
+
 _NEAREST = 8
 _FRAMES = 24  # frames by which an edge is judged
 _RIGID = 0.05  # change of length, relative to the length at rest, at which an edge counts half
 
 
-def moving_together(
-    points: np.ndarray, canonical: np.ndarray, faces: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def moving_together(points: np.ndarray, canonical: np.ndarray, faces: np.ndarray | None) -> Graph:
     """Neighbours over mesh edges, or over the nearest points where there are no faces.
 
     An edge counts the less the more its length changes over the frames, so that parts that only touch at rest are not
@@ -38,12 +38,9 @@ def moving_together(
     return indptr, columns.astype(np.int64), shares
 
 
-def average(graph: tuple[np.ndarray, np.ndarray, np.ndarray], values: np.ndarray) -> np.ndarray:
-    """Half each point's value (N,), half its neighbours' mean."""
-    indptr, indices, shares = graph
-    rows = np.repeat(np.arange(len(values)), np.diff(indptr))
-    mean = np.bincount(rows, shares * values[indices], minlength=len(values))
-    return np.where(np.diff(indptr) > 0, 0.5 * (values + mean), values)
+def alone(count: int) -> Graph:
+    """The graph without edges."""
+    return np.zeros(count + 1, np.int64), np.zeros(0, np.int64), np.zeros(0)
 
 
 def _lengths(points: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:

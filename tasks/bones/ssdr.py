@@ -1,25 +1,39 @@
 """Smooth skinning decomposition with rigid bones (Le & Deng 2012): the paper's free-form bones.
 
-From motion clusters, alternate between skin weights (:mod:`tasks.bones.weights`) and rigid bone transforms
-(:mod:`tasks.bones.transforms`) with Nesterov extrapolation of the transforms between rounds.
+Skin weights (:mod:`tasks.bones.weights`) and rigid bone transforms (:mod:`tasks.bones.transforms`) take turns, with
+Nesterov extrapolation of the transforms between rounds. Two things keep it out of poor local optima at little cost:
+it starts with more bones than wanted and removes those that are missed least, and it works on a sample of the points
+until the bones stand, for their transforms need far fewer points than a dense mesh has.
 """
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
+
 import numpy as np
+from scipy.spatial import cKDTree
 
 from tasks.bones import transforms, weights
-from tasks.bones.graph import moving_together
+from tasks.bones.clustering import split
+from tasks.bones.graph import Graph, moving_together
 from tasks.bones.trajectories import Trajectories, compress
 from tasks.errors import InputError
 from tasks.geometry.measure import vertex_rmse
 from tasks.geometry.skinning import skin
 from tasks.values import Canonical, Clusters, Motion, Skinning
 
-_SAMPLE = 1000  # points from which the basis of all paths is taken
+_SPAN = 1000  # points from which the basis of all paths is taken
 _SWEEPS = 2  # Gauss-Seidel sweeps a round: more bring nothing
-_SETTLE = 6  # sweeps after pruning, on frozen weights
-_FULL_SEARCH = 2  # first rounds with several exchanges a point
+_SETTLE = 6  # sweeps at the end, on frozen weights
+_LLOYD = 4  # reassignments after each split of the start
+_STILL = 1e-5  # error relative to the shape's radius at which nothing is left to split: float32 resolves no less
+_WARM_UP = 4  # rounds with surplus bones
+_REMOVED = 0.12  # part of the bones removed at a time
+_BETWEEN = 2  # rounds after each removal
+_SHARED = 0.1  # overlap above which two bones are not removed together: each may be what replaces the other
+_FINISH = 3  # rounds on all points
+_FIRST_EXCHANGES = 3  # exchanges a point makes in the first round of a run
 
 
 def ssdr(
@@ -28,7 +42,9 @@ def ssdr(
     clusters: Clusters,
     *,
     influences: int,
+    surplus: float,
     iterations: int,
+    sample: int,
     smoothness: float,
     compression: float,
     prune: float,
@@ -36,115 +52,150 @@ def ssdr(
 ) -> Skinning:
     """Weights W (N, B) and rigid transforms T (F, B, 3, 4) that minimise sum |sum_b w_nb T_fb v_n - x_fn|^2.
 
-    influences: most bones a point may have; iterations: rounds; smoothness: weight of the squared difference to the
-    neighbours' mean weights, against squared errors relative to the shape's radius; compression: error allowed to the
-    compressed paths, as a fraction of the clusters' own error; prune: weights below are removed at the end.
+    influences: most bones a point may have; surplus: bones to start with, as a multiple of those wanted;
+    iterations: rounds once the surplus is gone; sample: points that take part until the last rounds;
+    smoothness: weight of the squared difference to the neighbours' mean weights, against squared errors relative to
+    the shape's radius; compression: error allowed to the compressed paths, as a fraction of the clusters' own error;
+    prune: weights below are removed in the last rounds. B is the number of clusters. Cost: linear in N and in F.
+    history: vertex RMSE after every round, of the sample first, the last exactly that of the result.
     Raises InputError for settings out of range. Source: Le & Deng, SIGGRAPH Asia 2012, eq. 2-8, solved as described in
     the modules named above.
     """
-    _check(influences, iterations, prune)
-    paths, offsets = _start(train, canonical, clusters, compression, seed)
+    _check(influences, surplus, iterations, sample, prune)
+    rng = np.random.default_rng(seed)
+    total = len(canonical.points)
+    chosen = np.sort(rng.choice(total, min(total, sample), replace=False))
+    paths = _paths(train, canonical, clusters, compression, chosen)
+    part, wanted = paths.take(chosen), int(clusters.labels.max()) + 1
+    bones = _start(part, clusters.labels[chosen], math.ceil(surplus * wanted), influences)
+    history = _alternate(part, bones, _WARM_UP)
+    while len(bones.offsets) > wanted:
+        _remove(part, bones, wanted)
+        history += _alternate(part, bones, _BETWEEN)
+    history += _alternate(part, bones, iterations)
     graph = moving_together(train.points, canonical.points, canonical.faces)
-    index = np.full((len(canonical.points), influences), -1, np.int32)
-    index[:, 0] = clusters.labels
-    value = np.zeros(index.shape)
-    value[:, 0] = 1.0
-    history = _alternate(paths, graph, index, value, offsets, iterations, smoothness)
-    _settle(paths, graph, index, value, offsets, prune, smoothness)
-    dense = _dense(index, value, len(offsets))
-    moved = paths.alignment.to_world(offsets).astype(np.float32)
-    reached = vertex_rmse(skin(canonical.points, dense, moved), train.points)
-    return Skinning(canonical.points.astype(np.float32), dense, moved, np.append(history, reached))
+    near = cKDTree(part.rest[:, :3]).query(paths.rest[:, :3])[1]
+    bones.index, bones.value = bones.index[near], bones.value[near]
+    history += _alternate(paths, bones, _FINISH, graph=graph, smoothness=smoothness, prune=prune)
+    k, y = transforms.sums(paths, bones.index, bones.value, wanted)
+    transforms.sweep(k, y, bones.offsets, _SETTLE)
+    weights_of_points = _dense(bones)
+    moved = paths.alignment.to_world(bones.offsets).astype(np.float32)
+    reached = vertex_rmse(skin(canonical.points, weights_of_points, moved), train.points)
+    return Skinning(canonical.points.astype(np.float32), weights_of_points, moved, np.append(history, reached))
 
 
-def _check(influences: int, iterations: int, prune: float) -> None:
-    if influences < 1:
-        raise InputError("bones.influences", expected="at least 1", found=str(influences))
-    if iterations < 1:
-        raise InputError("bones.iterations", expected="at least 1", found=str(iterations))
+@dataclass
+class _Bones:
+    """The state of the decomposition. index: (N, S) int32, -1 for none; value: (N, S); offsets: (B, 4, 3, F)."""
+
+    index: np.ndarray
+    value: np.ndarray
+    offsets: np.ndarray
+
+
+def _check(influences: int, surplus: float, iterations: int, sample: int, prune: float) -> None:
+    for name, found, least in (("influences", influences, 1), ("iterations", iterations, 0), ("sample", sample, 100)):
+        if found < least:
+            raise InputError(f"bones.{name}", expected=f"at least {least}", found=str(found))
+    if not surplus >= 1.0:
+        raise InputError("bones.surplus", expected="at least 1", found=str(surplus))
     if not 0.0 <= prune * influences < 1.0:
         raise InputError("bones.prune", expected="at least 0 and below 1 / influences", found=str(prune))
 
 
-def _start(
-    train: Motion, canonical: Canonical, clusters: Clusters, compression: float, seed: int
-) -> tuple[Trajectories, np.ndarray]:
-    """Compressed paths and the clusters' transforms as offsets."""
-    rng = np.random.default_rng(seed)
-    count = len(canonical.points)
-    sample = np.sort(rng.choice(count, min(count, _SAMPLE), replace=False))
-    chosen, labels = canonical.points[sample].astype(np.float64), clusters.labels[sample]
+def _paths(
+    train: Motion, canonical: Canonical, clusters: Clusters, compression: float, chosen: np.ndarray
+) -> Trajectories:
+    """Paths compressed as far as the clusters' error, judged on some of the points, allows."""
+    chosen = chosen[:: math.ceil(len(chosen) / _SPAN)]
+    rest, labels = canonical.points[chosen].astype(np.float64), clusters.labels[chosen]
     total = 0.0
     for t, x in zip(clusters.transforms, train.points, strict=True):
-        moved = np.einsum("nij,nj->ni", t[labels][..., :3].astype(np.float64), chosen) + t[labels][..., 3]
-        total += float(np.sum((moved - x[sample]) ** 2))
-    tolerance = compression * np.sqrt(total / (len(sample) * train.frames))
-    paths = compress(train.points, canonical.points, tolerance=tolerance, sample=sample)
-    return paths, paths.alignment.from_world(clusters.transforms)
+        moved = np.einsum("nij,nj->ni", t[labels][..., :3].astype(np.float64), rest) + t[labels][..., 3]
+        total += float(np.sum((moved - x[chosen]) ** 2))
+    tolerance = compression * np.sqrt(total / (len(chosen) * train.frames))
+    return compress(train.points, canonical.points, tolerance=tolerance, sample=chosen)
+
+
+def _start(part: Trajectories, labels: np.ndarray, count: int, influences: int) -> _Bones:
+    """Rigid clusters, split further to the given count; every point follows its own."""
+    labels = np.unique(labels, return_inverse=True)[1].reshape(-1).astype(np.int32)
+    labels = split(part, labels, min(count, len(labels) // 3), _LLOYD, _STILL * part.alignment.scale)
+    index = np.full((len(labels), influences), -1, np.int32)
+    value = np.zeros(index.shape)
+    index[:, 0], value[:, 0] = labels, 1.0
+    k, y = transforms.sums(part, index, value, int(labels.max()) + 1)
+    each = np.arange(len(k))
+    return _Bones(index, value, transforms.rigid_fit(k[each, each], y)[0])
 
 
 def _alternate(
     paths: Trajectories,
-    graph: tuple[np.ndarray, np.ndarray, np.ndarray],
-    index: np.ndarray,
-    value: np.ndarray,
-    offsets: np.ndarray,
-    iterations: int,
-    smoothness: float,
+    bones: _Bones,
+    rounds: int,
+    *,
+    graph: Graph | None = None,
+    smoothness: float = 0.0,
+    prune: float = 0.0,
 ) -> list[float]:
-    """Rounds of weights and transforms, in place. Returns the vertex RMSE after each round.
+    """Rounds of weights and transforms, in place. Returns the vertex RMSE after each.
 
-    The extrapolation grows while the error falls and starts anew when it rises.
+    The extrapolation grows while the error falls and starts anew when it rises. Points look for other bones in every
+    second round only.
     """
-    whole = float(np.sum(paths.path.astype(np.float64) ** 2))
-    history, before, step = [], offsets.copy(), 0.0
-    for i in range(iterations):
-        guess = transforms.extrapolate(offsets, before, step) if step > 0 else offsets.copy()
-        rounds = 3 if i < _FULL_SEARCH else (i + 1) % 2
-        bones = weights.forms(paths, guess)
-        weights.exchange(paths, bones, index, value, rounds=rounds, smoothness=smoothness, graph=graph)
-        k, y = transforms.sums(paths, index, value, len(offsets))
-        error = paths.rmse(whole + transforms.sweep(k, y, guess, _SWEEPS))
-        before[:] = offsets
-        offsets[:] = guess
-        rising = bool(history) and error > history[-1]
-        step = 0.0 if rising else min(0.95, max(0.4, step + 0.1))
+    history, before, step = [], bones.offsets, 0.0
+    for i in range(rounds):
+        guess = transforms.extrapolate(bones.offsets, before, step) if step > 0 else bones.offsets.copy()
+        forms = weights.forms(paths, guess)
+        exchanges = _FIRST_EXCHANGES if i == 0 else (i + 1) % 2
+        weights.exchange(paths, forms, bones.index, bones.value, rounds=exchanges, smoothness=smoothness, graph=graph)
+        _prune(bones, prune)
+        k, y = transforms.sums(paths, bones.index, bones.value, len(guess))
+        error = paths.rmse(paths.squared + transforms.sweep(k, y, guess, _SWEEPS))
+        before, bones.offsets = bones.offsets, guess
+        step = 0.0 if history and error > history[-1] else min(0.95, max(0.4, step + 0.1))
         history.append(error)
     return history
 
 
-def _settle(
-    paths: Trajectories,
-    graph: tuple[np.ndarray, np.ndarray, np.ndarray],
-    index: np.ndarray,
-    value: np.ndarray,
-    offsets: np.ndarray,
-    prune: float,
-    smoothness: float,
-) -> None:
-    """Removes small weights and fits what is left, transforms last, so that both agree."""
-    for _ in range(2):
-        _prune(index, value, prune)
-        k, y = transforms.sums(paths, index, value, len(offsets))
-        transforms.sweep(k, y, offsets, _SWEEPS)
-        bones = weights.forms(paths, offsets)
-        weights.exchange(paths, bones, index, value, rounds=0, smoothness=smoothness, graph=graph)
-    _prune(index, value, prune)
-    k, y = transforms.sums(paths, index, value, len(offsets))
-    transforms.sweep(k, y, offsets, _SETTLE)
+def _remove(part: Trajectories, bones: _Bones, wanted: int) -> None:
+    """Removes some of the bones that are missed least, in place; never two that share many points."""
+    count = len(bones.offsets)
+    room = min(count - wanted, max(1, int(_REMOVED * count)))
+    loss = weights.losses(part, weights.forms(part, bones.offsets), bones.index, bones.value)
+    k, _ = transforms.sums(part, bones.index, bones.value, count)
+    size = np.sqrt(np.einsum("bb->b", k[:, :, 3, 3])) + 1e-300
+    overlap = k[:, :, 3, 3] / (size[:, None] * size)
+    gone: list[int] = []
+    for b in np.argsort(loss, kind="stable"):
+        if len(gone) < room and all(overlap[b, c] < _SHARED for c in gone):
+            gone.append(int(b))
+    kept = np.setdiff1d(np.arange(count), gone)
+    number = np.full(count + 1, -1, np.int32)
+    number[kept] = np.arange(len(kept))
+    bones.offsets = np.ascontiguousarray(bones.offsets[kept])
+    bones.index = number[bones.index]
+    bones.value[bones.index < 0] = 0.0
+    lost = bones.value.sum(1) < 1e-6
+    if lost.any():
+        nearest = weights.nearest_bone(part, weights.forms(part, bones.offsets))[0]
+        bones.index[lost], bones.value[lost] = -1, 0.0
+        bones.index[lost, 0], bones.value[lost, 0] = nearest[lost], 1.0
+    bones.value /= bones.value.sum(1, keepdims=True)
 
 
-def _prune(index: np.ndarray, value: np.ndarray, least: float) -> None:
+def _prune(bones: _Bones, least: float) -> None:
     """Drops weights below `least`, in place; the rest sum to one again."""
-    small = (value < least) & (value < value.max(1, keepdims=True))
-    value[small] = 0.0
-    index[value <= 0.0] = -1
-    value /= value.sum(1, keepdims=True)
+    small = (bones.value < least) & (bones.value < bones.value.max(1, keepdims=True))
+    bones.value[small] = 0.0
+    bones.index[bones.value <= 0.0] = -1
+    bones.value /= bones.value.sum(1, keepdims=True)
 
 
-def _dense(index: np.ndarray, value: np.ndarray, count: int) -> np.ndarray:
-    """(N, S) sparse weights -> (N, B) float32."""
-    out = np.zeros((len(index), count), np.float32)
-    rows, places = np.nonzero(index >= 0)
-    out[rows, index[rows, places]] = value[rows, places]
+def _dense(bones: _Bones) -> np.ndarray:
+    """Weights as (N, B) float32."""
+    out = np.zeros((len(bones.index), len(bones.offsets)), np.float32)
+    rows, places = np.nonzero(bones.index >= 0)
+    out[rows, bones.index[rows, places]] = bones.value[rows, places]
     return out

@@ -6,7 +6,8 @@ need only products of paths with bone motions, so a path is replaced by its P co
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numba import njit
@@ -71,14 +72,24 @@ class Trajectories:
         """Number of frames F."""
         return len(self.basis) // 3
 
+    @cached_property
+    def squared(self) -> float:
+        """Sum of |u|^2 that is left after compression."""
+        return sum(for_chunks(lambda a, b: float(np.sum(self.path[a:b].astype(np.float64) ** 2)), len(self.path), 4096))
+
     def rmse(self, objective: float) -> float:
         """Sum of squared differences among coefficients -> vertex RMSE in the unit of the data.
 
         What compression dropped is added as if no bone could explain any of it.
         """
-        dropped = max(self.energy - float(np.sum(self.path.astype(np.float64) ** 2)), 0.0)
-        total = max(objective, 0.0) + dropped
+        total = max(objective, 0.0) + max(self.energy - self.squared, 0.0)
         return self.alignment.scale * float(np.sqrt(total / (self.frames * len(self.rest))))
+
+    def take(self, chosen: np.ndarray) -> Trajectories:
+        """Some of the points, with their share of what compression dropped."""
+        dropped = max(self.energy - self.squared, 0.0) * len(chosen) / len(self.rest)
+        part = replace(self, rest=self.rest[chosen], path=self.path[chosen])
+        return replace(part, energy=part.squared + dropped)
 
 
 def align(points: np.ndarray, canonical: np.ndarray, sample: np.ndarray) -> Alignment:

@@ -19,7 +19,7 @@ from tasks.bones.trajectories import Trajectories
 from tasks.geometry.parallel import for_chunks
 
 _POINTS = 2048  # points whose sums are taken together
-_FRAMES = 16  # frames solved together: their offsets fit the second-level cache
+_FRAMES = 64  # frames solved together: enough for long inner loops, and their offsets fit the second-level cache
 _HOLD = 1e-7  # how firmly a rotation that the points do not determine keeps its last value
 
 
@@ -112,12 +112,16 @@ def _target(k, y, offsets, b, start, stop, skip, out):
     for c in range(len(k)):
         if k[b, c, 3, 3] == 0.0 or (skip and c == b):
             continue
-        for i in range(4):
-            k0, k1, k2, k3 = k[b, c, i, 0], k[b, c, i, 1], k[b, c, i, 2], k[b, c, i, 3]
-            for d in range(3):
-                d0, d1, d2, d3 = offsets[c, 0, d], offsets[c, 1, d], offsets[c, 2, d], offsets[c, 3, d]
-                for f in range(start, stop):
-                    out[i, d, f - start] -= k0 * d0[f] + k1 * d1[f] + k2 * d2[f] + k3 * d3[f]
+        m = k[b, c]
+        for d in range(3):
+            d0, d1, d2, d3 = offsets[c, 0, d], offsets[c, 1, d], offsets[c, 2, d], offsets[c, 3, d]
+            o0, o1, o2, o3 = out[0, d], out[1, d], out[2, d], out[3, d]
+            for f in range(stop - start):
+                x0, x1, x2, x3 = d0[start + f], d1[start + f], d2[start + f], d3[start + f]
+                o0[f] -= m[0, 0] * x0 + m[0, 1] * x1 + m[0, 2] * x2 + m[0, 3] * x3
+                o1[f] -= m[1, 0] * x0 + m[1, 1] * x1 + m[1, 2] * x2 + m[1, 3] * x3
+                o2[f] -= m[2, 0] * x0 + m[2, 1] * x1 + m[2, 2] * x2 + m[2, 3] * x3
+                o3[f] -= m[3, 0] * x0 + m[3, 1] * x1 + m[3, 2] * x2 + m[3, 3] * x3
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from tasks.bones.graph import Graph, alone
 from tasks.bones.products import FAST, product
 from tasks.bones.trajectories import Trajectories
 from tasks.geometry.parallel import for_chunks
@@ -66,15 +67,16 @@ def exchange(
     *,
     rounds: int,
     smoothness: float,
-    graph: tuple[np.ndarray, np.ndarray, np.ndarray],
+    graph: Graph | None,
 ) -> np.ndarray:
     """Improves sparse weights in place; returns each point's squared error, (N,) mean over frames.
 
     index: (N, S) int32, -1 for an empty place; value: (N, S) float64; rounds: exchanges tried, 0 keeps the support;
-    smoothness: weight of |w - mean of the neighbours' w|^2; graph: neighbours as (indptr, indices, shares).
+    smoothness: weight of |w - mean of the neighbours' w|^2; graph: see :mod:`tasks.bones.graph`.
     """
     error = np.empty(len(index))
-    last = (index.copy(), value.copy())
+    last = (index.copy(), value.copy())  # neighbours' weights are those of the round before, for any order of points
+    graph = alone(len(index)) if graph is None else graph
 
     def work(start: int, stop: int) -> None:
         _exchange(
@@ -96,6 +98,20 @@ def exchange(
 
     for_chunks(work, len(index), _POINTS)
     return error
+
+
+def losses(paths: Trajectories, bones: Forms, index: np.ndarray, value: np.ndarray) -> np.ndarray:
+    """How much the squared error would rise without each bone, if every point could take one other in its place.
+
+    index, value: see :func:`exchange` -> (B,) sum over points of means over frames.
+    """
+    loss = np.empty(index.shape)
+
+    def work(start: int, stop: int) -> None:
+        _losses(paths.rest, paths.path, paths.frames, bones.linear, bones.square, index, value, loss, start, stop)
+
+    for_chunks(work, len(index), _POINTS)
+    return np.bincount(np.maximum(index, 0).ravel(), loss.ravel(), minlength=len(bones.square))
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
@@ -184,7 +200,7 @@ def _exchange(rest, path, frames, linear, square, index, value, error, rounds, s
             size = _solve(q, bones, w, size)
             now = _value(q, w, size)
             for _ in range(rounds):
-                found = _best_bone(square, diagonal, hh, c, e, smoothness, bones, w, size, now, reach)
+                found = _best_bone(square, diagonal, hh, c, e, smoothness, bones, w, size, now, reach, -1)
                 if found < 0:
                     break
                 before = now
@@ -194,6 +210,67 @@ def _exchange(rest, path, frames, linear, square, index, value, error, rounds, s
             error[n] = max(now, 0.0)
             for s in range(slots):
                 index[n, s], value[n, s] = (bones[s], w[s]) if s < size else (-1, 0.0)
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _losses(rest, path, frames, linear, square, index, value, loss, start, stop):
+    count, slots = len(square), index.shape[1]
+    raw, correlation = np.empty((_TILE, 4 * count)), np.empty((_TILE, count))
+    energy, hh = np.empty(_TILE), np.empty(10)
+    diagonal, reach = np.empty((10, count)), np.empty(count)
+    for b in range(count):
+        for k in range(10):
+            diagonal[k, b] = square[b, k, b]
+    bones, w = np.empty(slots + 1, np.int64), np.empty(slots + 1)
+    q = np.empty((slots + 1, slots + 1))
+    for low in range(start, stop, _TILE):
+        high = min(low + _TILE, stop)
+        _correlate(rest, path, frames, linear, low, high, raw, correlation, energy)
+        for n in range(low, high):
+            c, e = correlation[n - low], energy[n - low]
+            _products_of(rest[n], hh)
+            whole = -1.0
+            for out in range(-1, slots):
+                loss_of_all = out < 0
+                if not loss_of_all and index[n, out] < 0:
+                    loss[n, out] = 0.0
+                    continue
+                size, total = 0, 0.0
+                for s in range(slots):
+                    if index[n, s] >= 0 and s != out:
+                        bones[size], w[size] = index[n, s], value[n, s]
+                        total += w[size]
+                        size += 1
+                banned = -1 if loss_of_all else index[n, out]
+                if size == 0 or total <= 0.0:
+                    bones[0] = _best_alone(diagonal, hh, c, e, banned)
+                    w[0], size, total = 1.0, 1, 1.0
+                for s in range(size):
+                    w[s] /= total
+                _form(square, hh, c, e, 0.0, bones, size, q)
+                size = _solve(q, bones, w, size)
+                now = _value(q, w, size)
+                if loss_of_all:
+                    whole = now
+                    continue
+                found = _best_bone(square, diagonal, hh, c, e, 0.0, bones, w, size, now, reach, banned)
+                if found >= 0:
+                    size, now = _bring_in(square, hh, c, e, 0.0, bones, w, size, slots, now, q, found)
+                loss[n, out] = max(now - whole, 0.0)
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _best_alone(diagonal, hh, c, e, banned):
+    best, least = 0, np.inf
+    for b in range(diagonal.shape[1]):
+        if b == banned:
+            continue
+        total = e - 2.0 * c[b]
+        for k in range(10):
+            total += hh[k] * diagonal[k, b]
+        if total < least:
+            best, least = b, total
+    return best
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
@@ -229,8 +306,8 @@ def _value(q, w, size):
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _best_bone(square, diagonal, hh, c, e, smoothness, bones, w, size, now, reach):
-    """The bone outside the support towards which w^T Q w falls most along a line, or -1."""
+def _best_bone(square, diagonal, hh, c, e, smoothness, bones, w, size, now, reach, banned):
+    """The bone outside the support, and not banned, towards which w^T Q w falls most along a line, or -1."""
     count = len(square)
     shift = e
     for b in range(count):
@@ -245,7 +322,7 @@ def _best_bone(square, diagonal, hh, c, e, smoothness, bones, w, size, now, reac
     best, most = -1, _GAIN * now
     for b in range(count):
         along = reach[b] + shift - c[b]  # <r, d_b>
-        if along >= now:
+        if along >= now or b == banned:
             continue
         own = e - 2.0 * c[b] + smoothness
         for k in range(10):

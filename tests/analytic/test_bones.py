@@ -17,7 +17,16 @@ from tasks.geometry.skinning import skin
 from tasks.values import Canonical, Motion, same
 
 CLUSTERING = {"max_bones": 12, "count": "auto", "slack": 0.05, "exact": 1e-4, "rounds": 4, "seed": 0}
-SSDR = {"influences": 4, "iterations": 20, "smoothness": 0.0, "compression": 0.01, "prune": 0.0, "seed": 0}
+SSDR = {
+    "influences": 4,
+    "surplus": 1.6,
+    "iterations": 20,
+    "sample": 4000,
+    "smoothness": 0.0,
+    "compression": 0.01,
+    "prune": 0.0,
+    "seed": 0,
+}
 
 
 def motion_of(points: np.ndarray) -> Motion:
@@ -163,7 +172,9 @@ def test_nearest_rotation_against_singular_values(kind: str) -> None:
         assert np.linalg.det(r) > 0.999
 
 
-@pytest.mark.parametrize(("setting", "value"), [("influences", 0), ("iterations", 0), ("prune", 0.5)])
+@pytest.mark.parametrize(
+    ("setting", "value"), [("influences", 0), ("iterations", -1), ("surplus", 0.5), ("sample", 0), ("prune", 0.5)]
+)
 def test_settings_out_of_range_are_named(setting: str, value: float) -> None:
     rng = np.random.default_rng(9)
     points, labels = boxes(rng, 2)

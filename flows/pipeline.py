@@ -19,7 +19,7 @@ class Planned:
 
     case: Case
     name: str
-    metrics: Node
+    metrics: tuple[Node, ...]
     nodes: dict[str, tuple[Node, str]] = field(default_factory=dict)
 
 
@@ -63,19 +63,12 @@ def plan(case: Case, graph: Graph) -> Planned:
     }
     method = schema.animate_function(config["animate"]["function"])
     animation = add("animate", method, config["animate"], "animation", training=training, query=found["query"])
-    metrics = add(
-        "evaluate", schema.EVALUATE, config["evaluate"], "metrics",
-        animation=animation["animation"], test=test, training=training,
-    )  # fmt: skip
-    nodes = {
-        "train": train,
-        "test": test,
-        "clusters": clusters,
-        "animation": animation["animation"],
-        **found,
-        **training,
-    }
-    return Planned(case, name, metrics, nodes)
+    unseen = {"animation": animation["animation"], "test": test, "canonical": canonical}
+    result = add("evaluate", schema.EVALUATE, config["evaluate"], "metrics", **unseen)
+    shared = {"train": train, "canonical": canonical, "skinning": skinning, "skeleton": skeleton}
+    rig = add("evaluate", schema.EVALUATE_RIG, config["evaluate"], "metrics", **shared, poses=found["poses"])
+    named = {"test": test, "clusters": clusters, "animation": animation["animation"]}
+    return Planned(case, name, (result, rig), named | found | training)
 
 
 def _skeleton(settings: dict, add, train, test, canonical, skinning) -> dict[str, tuple[Node, str]]:

@@ -19,7 +19,7 @@ PACKAGE = "skelebones"
 def provenance(cases: list[Case], graph: Graph, refs: dict[str, Ref], computed: set[str]) -> dict:
     """A report's provenance as plain JSON."""
     return {
-        "command": ["python", "-m", "flows.run", *sys.argv[1:]],
+        "command": ["python", "-m", "flows.run", *(_without_folders(a) for a in sys.argv[1:])],
         "git": git_state(),
         "versions": versions(),
         "machine": {"system": platform.platform(), "python": platform.python_version(), "cpu": platform.machine()},
@@ -49,7 +49,7 @@ def portable(config: dict) -> dict:
     """A config without what belongs to one machine: the store, the runner, the folders of inputs and reports."""
     kept = {name: value for name, value in config.items() if name not in ("store", "runner")}
     if isinstance(kept["dataset"].get("path"), str):
-        kept["dataset"] = kept["dataset"] | {"path": kept["dataset"]["path"].replace("\\", "/").rpartition("/")[2]}
+        kept["dataset"] = kept["dataset"] | {"path": _without_folders(kept["dataset"]["path"])}
     kept["report"] = {name: value for name, value in kept["report"].items() if name != "path"}
     return kept
 
@@ -57,7 +57,13 @@ def portable(config: dict) -> dict:
 def inputs(graph: Graph) -> dict[str, str]:
     """Name of every input file or folder -> sha256 of its bytes."""
     loaders = [node for node in graph.nodes.values() if node.files]
-    return {str(node.settings["path"]).replace("\\", "/").rpartition("/")[2]: node.files for node in loaders}
+    return {_without_folders(str(node.settings["path"])): node.files for node in loaders}
+
+
+def _without_folders(text: str) -> str:
+    """A path's last name, or KEY=NAME for KEY=PATH: folders belong to one machine."""
+    key, equals, value = text.rpartition("=")
+    return f"{key}{equals}{value.replace(chr(92), '/').rstrip('/').rpartition('/')[2]}"
 
 
 def git_state() -> dict:

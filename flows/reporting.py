@@ -16,7 +16,8 @@ from flows.store import Ref, Store
 
 UNSEEN = ("rmse_pct", "rmse", "rmse_coordinate")
 MOTION = ("velocity_rmse", "speed_ratio", "max_error")
-RIG = ("bones_rmse_pct", "bones_rmse", "bones_count", "skeleton_rmse_pct", "joints_count")
+RIG = ("bones_rmse_pct", "bones_count", "skeleton_rmse_pct", "joints_count")
+TRUTH = ("joint_f1", "joint_f1_fine", "link_f1", "j2j_pct", "j2b_pct", "b2b_pct")
 
 
 @dataclass(frozen=True)
@@ -47,20 +48,19 @@ def write(
 
 
 def _rows(case: Planned, refs: dict[str, Ref], store: Store):
-    from tasks.evaluation.rows import rows_of
+    from tasks.evaluation.rows import join, rows_of
 
-    ref = refs[case.metrics.id]
     config = case.case.config
-    return rows_of(
-        store.load(ref, "metrics"),
-        experiment=config["report"]["name"],
-        dataset=case.case.dataset,
-        subject=_subject(case, refs, store),
-        method=case.case.method,
-        variant=_variant(case),
-        seed=config["seed"],
-        key=ref.key,
-    )
+    labels = {
+        "experiment": config["report"]["name"],
+        "dataset": case.case.dataset,
+        "subject": _subject(case, refs, store),
+        "method": case.case.method,
+        "variant": _variant(case),
+        "seed": config["seed"],
+    }
+    found = [refs[node.id] for node in case.metrics]
+    return join([rows_of(store.load(ref, "metrics"), key=ref.key, **labels) for ref in found])
 
 
 def _tables(planned: list[Planned], rows, settings: dict) -> list:
@@ -83,7 +83,10 @@ def _tables(planned: list[Planned], rows, settings: dict) -> list:
     motion = build(rows, title="Motion of the same results", metrics=MOTION, notes=[], **common)
     rig_notes = ["Bones and skeleton are shared by all methods; errors on the training frames they were fitted to."]
     rig = build(lead, title="Bones and skeleton", metrics=RIG, notes=rig_notes, **common)
-    return [first, motion, rig]
+    tables = [first, motion, rig]
+    if rows["metric"].isin(TRUTH).any():
+        tables.append(build(lead, title="Joints against the true rig", metrics=TRUTH, notes=[], **common))
+    return tables
 
 
 def _notes(planned: list[Planned], settings: dict) -> list[str]:

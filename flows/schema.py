@@ -31,6 +31,7 @@ POSES = "tasks.skeleton.poses:fit_poses"
 DATABASE = "tasks.motion.database:build_database"
 PARTS = "tasks.motion.parts:find_parts"
 EVALUATE = "tasks.evaluation.metrics:evaluate"
+EVALUATE_RIG = "tasks.evaluation.rig:evaluate_rig"
 
 REPORT = {
     "name": str,
@@ -89,7 +90,7 @@ def schema(config: dict) -> dict[str, object]:
             **settings(animate_function(animate.get("function", ""))),
         },
         "parts": settings(PARTS),
-        "evaluate": settings(EVALUATE),
+        "evaluate": settings(EVALUATE) | settings(EVALUATE_RIG),
         "report": REPORT,
         "store": {"path": str},
         "runner": {"kind": Literal["threads", "processes"], "workers": int},

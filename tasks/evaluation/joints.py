@@ -30,7 +30,8 @@ def counting_joints(rig: Rig, degrees: float) -> tuple[np.ndarray, np.ndarray]:
     keep = np.flatnonzero(counts)
     new = np.full(len(counts), -1)
     new[keep] = np.arange(len(keep))
-    return rig.joints[keep], new[_ancestors(rig.parents, counts)[keep]] if len(keep) else new[keep]
+    above = _ancestors(rig.parents, counts)[keep]
+    return rig.joints[keep], np.where(above < 0, -1, new[above])
 
 
 def joint_scores(

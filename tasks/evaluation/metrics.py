@@ -7,15 +7,13 @@ data is in metres and in the data's own unit elsewhere; percentages are of the c
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from tasks.geometry import kinematics, measure
-from tasks.geometry.skinning import skin
-from tasks.values import Animation, Metrics, Motion, Training
+from tasks.geometry import measure
+from tasks.values import Animation, Canonical, Metrics, Motion
 
 FRAMES_AT_ONCE = 64  # bounds the memory of float64 differences; sums are per frame, so it does not change a bit
 
@@ -46,7 +44,14 @@ METRICS: dict[str, Metric] = {
     "skeleton_rmse_pct": Metric("skeleton RMSE", "percent", "lower", "the same in % of the diagonal", 2),
     "bones_count": Metric("bones", "count", "none", "number of free-form bones B", 0),
     "joints_count": Metric("joints", "count", "none", "number of joints J", 0),
-    "parts_count": Metric("parts", "count", "none", "number of body parts that are matched on their own", 0),
+    "joint_f1": Metric("joint F1", "ratio", "higher", "joints matched to true ones within 5 % of the diagonal", 3),
+    "joint_f1_fine": Metric("joint F1, 2.5 %", "ratio", "higher", "the same within 2.5 %", 3),
+    "joint_precision": Metric("joint precision", "ratio", "higher", "share of the joints found that match", 3),
+    "joint_recall": Metric("joint recall", "ratio", "higher", "share of the true joints that are matched", 3),
+    "link_f1": Metric("link F1", "ratio", "higher", "parent links between matched joints", 3),
+    "j2j_pct": Metric("J2J", "percent", "lower", "Chamfer distance joint to joint, % of the diagonal", 2),
+    "j2b_pct": Metric("J2B", "percent", "lower", "Chamfer distance joint to bone", 2),
+    "b2b_pct": Metric("B2B", "percent", "lower", "Chamfer distance bone to bone", 2),
     "psnr": Metric("PSNR", "decibel", "higher", "peak signal-to-noise ratio of rendered images", 2),
     "ssim": Metric("SSIM", "ratio", "higher", "structural similarity of rendered images", 3),
     "lpips": Metric("LPIPS", "ratio", "lower", "learned perceptual distance of rendered images", 4),
@@ -76,16 +81,19 @@ def score(value: float, better: str) -> float:
     return -value if better == "higher" else value
 
 
-def evaluate(animation: Animation, test: Motion, training: Training) -> Metrics:
-    """All numbers of one case: the result against the unseen clips, and what it was made of.
+def evaluate(animation: Animation, test: Motion, canonical: Canonical) -> Metrics:
+    """The numbers of a result against the unseen clips.
 
     animation.points: (F, N, 3), the result on the frames of ``test``. The metrics ``rmse`` and ``rmse_pct`` are also
     given for each test clip, as "rmse@clip". Velocities are left out where no clip has two frames, the speed ratio
     where the truth stands still. Raises ValueError where the result has another shape than the truth or is not finite.
     """
-    found = _animation_numbers(animation.points, test, measure.diagonal(training.canonical.points))
-    found.update(_training_numbers(training))
-    units = {name: unit_of(metric_of(name).kind, test.unit) for name in found}
+    return declared(_animation_numbers(animation.points, test, measure.diagonal(canonical.points)), test.unit)
+
+
+def declared(found: dict[str, float], data_unit: str) -> Metrics:
+    """Numbers in the data's unit as metrics in the units that they are reported in."""
+    units = {name: unit_of(metric_of(name).kind, data_unit) for name in found}
     return Metrics(
         names=tuple(found),
         units=tuple(units[name][0] for name in found),
@@ -152,34 +160,3 @@ def _velocity_numbers(points: np.ndarray, test: Motion) -> dict[str, float]:
     if true_speed > 0:
         found["speed_ratio"] = speed / true_speed
     return found
-
-
-def _training_numbers(training: Training) -> dict[str, float]:
-    skinning, skeleton, poses = training.skinning, training.skeleton, training.database.poses
-    diagonal = measure.diagonal(training.canonical.points)
-
-    def bones(piece: slice) -> np.ndarray:
-        return skin(skinning.rest, skinning.weights, skinning.transforms[piece])
-
-    def joints(piece: slice) -> np.ndarray:
-        rotations, shifts = poses.rotations[piece], poses.translations[piece]
-        transforms = kinematics.forward(skeleton.parents, skeleton.joints, rotations, shifts)
-        return skin(training.canonical.points, skeleton.weights, transforms)
-
-    bones_rmse = _rmse_in_pieces(bones, training.motion.points)
-    skeleton_rmse = _rmse_in_pieces(joints, training.motion.points)
-    return {
-        "bones_rmse": bones_rmse,
-        "bones_rmse_pct": 100.0 * bones_rmse / diagonal,
-        "skeleton_rmse": skeleton_rmse,
-        "skeleton_rmse_pct": 100.0 * skeleton_rmse / diagonal,
-        "bones_count": float(skinning.transforms.shape[1]),
-        "joints_count": float(len(skeleton.parents)),
-        "parts_count": float(len(training.parts.names)),
-    }
-
-
-def _rmse_in_pieces(make: Callable[[slice], np.ndarray], truth: np.ndarray) -> float:
-    """Vertex RMSE of a motion that is made a few frames at a time, so that it never lies in memory whole."""
-    pieces = [slice(a, min(a + FRAMES_AT_ONCE, len(truth))) for a in range(0, len(truth), FRAMES_AT_ONCE)]
-    return math.sqrt(np.concatenate([squared_errors(make(p), truth[p]).mean(1) for p in pieces]).mean())

@@ -7,9 +7,10 @@ import pytest
 
 from tasks.errors import InputError
 from tasks.evaluation.metrics import METRICS, clip_keys, evaluate, frame_rmse, metric_of, score, unit_of
+from tasks.evaluation.rig import at_canonical, evaluate_rig
 from tasks.evaluation.rows import COLUMNS, from_csv, join, rows_of, to_csv
 from tasks.geometry import rigid
-from tasks.values import Animation, Canonical, Database, Metrics, Motion, Parts, Poses, Skeleton, Skinning, Training
+from tasks.values import Animation, Canonical, Metrics, Motion, Poses, Rig, Skeleton, Skinning
 
 BOX = np.array([[0, 0, 0], [3, 0, 0], [0, 4, 0], [0, 0, 12]], np.float32)  # its bounding box's diagonal is 13
 
@@ -20,7 +21,10 @@ def motion(points: np.ndarray, clips: list[int], unit: str = "unit") -> Motion:
     return Motion("box", points.astype(np.float32), None, start, names, fps=10.0, unit=unit)
 
 
-def training(shift: float, unit: str = "unit") -> Training:
+SHAPE = Canonical(BOX, None, 0, "first")
+
+
+def rig_numbers(shift: float, unit: str = "unit") -> Metrics:
     """Four points that stand still; one bone that is ``shift`` off along x, one joint that is twice that off."""
     train = motion(np.repeat(BOX[None], 3, 0), [3], unit)
     bones = rigid.identity(3, 1)
@@ -28,16 +32,10 @@ def training(shift: float, unit: str = "unit") -> Training:
     moved = np.zeros((3, 1, 3), np.float32)
     moved[..., 0] = 2 * shift
     turns = np.broadcast_to(np.eye(3, dtype=np.float32), (3, 1, 3, 3)).copy()
-    poses = Poses(turns, moved, train.clip_start)
     ones = np.ones((4, 1), np.float32)
-    return Training(
-        motion=train,
-        canonical=Canonical(BOX, None, 0, "first"),
-        skinning=Skinning(BOX, ones, bones, np.zeros(1)),
-        skeleton=Skeleton(("root",), np.array([-1], np.int32), BOX[:1], ones),
-        database=Database(poses, bones, 10.0),
-        parts=Parts(("whole",), np.ones((1, 1), bool), np.zeros(1, np.int32), np.ones((1, 1), np.float32)),
-    )
+    skeleton = Skeleton(("root",), np.array([-1], np.int32), BOX[:1], ones)
+    skinning = Skinning(BOX, ones, bones, np.zeros(1))
+    return evaluate_rig(train, SHAPE, skinning, skeleton, Poses(turns, moved, train.clip_start), turn=5.0)
 
 
 def numbers(result: Metrics) -> dict[str, float]:
@@ -49,7 +47,7 @@ def test_errors_of_a_known_displacement():
     made = test.points.copy()
     made[0, 0] += [3, 4, 0]  # one point of 16, 5 away
     made[3] += [0, 0, 2]  # the last frame, every point 2 away
-    found = numbers(evaluate(Animation(made), test, training(0.5)))
+    found = numbers(evaluate(Animation(made), test, SHAPE))
     rmse = np.sqrt((25 + 4 * 4) / 16)
     assert found["rmse"] == pytest.approx(rmse)
     assert found["rmse_coordinate"] == pytest.approx(rmse / np.sqrt(3))
@@ -58,10 +56,25 @@ def test_errors_of_a_known_displacement():
     assert found["rmse@clip0"] == pytest.approx(np.sqrt(25 / 8))
     assert found["rmse@clip1"] == pytest.approx(np.sqrt(16 / 8))
     assert found["rmse_pct@clip1"] == pytest.approx(100 * np.sqrt(2) / 13)
+
+
+def test_bones_and_skeleton_by_themselves():
+    found = numbers(rig_numbers(0.5))
     assert found["bones_rmse"] == pytest.approx(0.5)
     assert found["bones_rmse_pct"] == pytest.approx(50 / 13)
     assert found["skeleton_rmse"] == pytest.approx(1.0)
-    assert (found["bones_count"], found["joints_count"], found["parts_count"]) == (1, 1, 1)
+    assert (found["bones_count"], found["joints_count"]) == (1, 1)
+    assert numbers(rig_numbers(0.25, "m"))["bones_rmse"] == pytest.approx(250)
+    assert numbers(rig_numbers(0.0))["bones_rmse"] == 0.0
+
+
+def test_true_joints_are_taken_where_the_canonical_frame_has_them():
+    turns = np.broadcast_to(np.eye(3, dtype=np.float32), (2, 2, 3, 3)).copy()
+    turns[1, 0] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]  # the root turns by 90 degrees about z
+    joints = np.array([[1, 0, 0], [3, 0, 0]], np.float32)
+    rig = Rig(("a", "b"), np.array([-1, 0]), joints, np.ones((4, 2)) / 2, turns, np.zeros((2, 2, 3), np.float32))
+    assert np.allclose(at_canonical(rig, Canonical(BOX, None, 1, "")).joints, [[1, 0, 0], [1, 2, 0]])
+    assert at_canonical(rig, Canonical(BOX, None, -1, "rest")) is rig
 
 
 def test_velocities_never_cross_a_cut():
@@ -71,45 +84,38 @@ def test_velocities_never_cross_a_cut():
     test = motion(BOX + along, [3, 3])
     slow = along.copy()
     slow[:, :, 0] = np.array([0, 0.75, 1.5, 0, 0.75, 1.5])[:, None]
-    found = numbers(evaluate(Animation((BOX + slow).astype(np.float32)), test, training(0.0)))
+    found = numbers(evaluate(Animation((BOX + slow).astype(np.float32)), test, SHAPE))
     assert found["speed_ratio"] == pytest.approx(0.75)
     assert found["velocity_rmse"] == pytest.approx(0.25 * 10)  # 10 frames a second
-    assert found["bones_rmse"] == 0.0
 
 
 def test_velocities_are_left_out_where_there_are_none():
     still = motion(np.repeat(BOX[None], 2, 0), [2])
-    assert "speed_ratio" not in numbers(evaluate(Animation(still.points), still, training(0.0)))
+    assert "speed_ratio" not in numbers(evaluate(Animation(still.points), still, SHAPE))
     single = motion(np.repeat(BOX[None], 2, 0), [1, 1])
-    found = numbers(evaluate(Animation(single.points), single, training(0.0)))
+    found = numbers(evaluate(Animation(single.points), single, SHAPE))
     assert "velocity_rmse" not in found
     assert found["rmse"] == 0.0
 
 
 def test_metres_are_reported_in_millimetres():
     test = motion(np.repeat(BOX[None], 2, 0), [2], "m")
-    result = evaluate(Animation(test.points + np.float32(0.5)), test, training(0.25, "m"))
+    result = evaluate(Animation(test.points + np.float32(0.5)), test, SHAPE)
     units = dict(zip(result.names, result.units, strict=True))
     found = numbers(result)
     assert found["rmse"] == pytest.approx(500 * np.sqrt(3))
-    assert found["bones_rmse"] == pytest.approx(250)
-    assert (units["rmse"], units["rmse_pct"], units["velocity_rmse"], units["bones_count"]) == (
-        "mm",
-        "%",
-        "mm/s",
-        "count",
-    )
+    assert (units["rmse"], units["rmse_pct"], units["velocity_rmse"]) == ("mm", "%", "mm/s")
     assert unit_of("length", "unit") == ("unit", 1.0)
 
 
 def test_a_result_that_does_not_fit_the_truth_is_a_defect():
     test = motion(np.repeat(BOX[None], 2, 0), [2])
     with pytest.raises(ValueError, match="shape"):
-        evaluate(Animation(test.points[:1]), test, training(0.0))
+        evaluate(Animation(test.points[:1]), test, SHAPE)
     bad = test.points.copy()
     bad[1, 2, 0] = np.nan
     with pytest.raises(ValueError, match="not finite in frame 1"):
-        evaluate(Animation(bad), test, training(0.0))
+        evaluate(Animation(bad), test, SHAPE)
 
 
 def test_frames_in_pieces_give_the_same_errors():
@@ -121,8 +127,8 @@ def test_frames_in_pieces_give_the_same_errors():
 
 def test_every_metric_is_declared_once_with_unit_and_direction():
     test = motion(np.repeat(BOX[None], 4, 0) + np.arange(4)[:, None, None], [2, 2])
-    result = evaluate(Animation(test.points + np.float32(0.1)), test, training(0.1))
-    assert {name.split("@")[0] for name in result.names} <= set(METRICS)
+    result = evaluate(Animation(test.points + np.float32(0.1)), test, SHAPE)
+    assert {name.split("@")[0] for name in (*result.names, *rig_numbers(0.1).names)} <= set(METRICS)
     assert metric_of("rmse@walk") is METRICS["rmse"]
     assert [score(2.0, way) for way in ("lower", "higher")] == [2.0, -2.0]
     assert score(0.5, "one") == score(2.0, "one") > score(1.1, "one")

@@ -1,0 +1,75 @@
+"""The numbers of bones and skeleton themselves, which all methods share."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from tasks.evaluation.joints import counting_joints, joint_scores
+from tasks.evaluation.metrics import FRAMES_AT_ONCE, declared, squared_errors
+from tasks.geometry import kinematics, measure
+from tasks.geometry.skinning import skin
+from tasks.values import Canonical, Metrics, Motion, Poses, Rig, Skeleton, Skinning
+
+_NAMED = {"precision": "joint_precision", "recall": "joint_recall", "f1": "joint_f1", "f1_fine": "joint_f1_fine"}
+_NAMED |= {"link_f1": "link_f1", "j2j": "j2j_pct", "j2b": "j2b_pct", "b2b": "b2b_pct"}
+
+
+def evaluate_rig(
+    train: Motion, canonical: Canonical, skinning: Skinning, skeleton: Skeleton, poses: Poses, *, turn: float
+) -> Metrics:
+    """Error of the bones alone and of the skeleton alone on the frames they were fitted to, and their counts.
+
+    Where the data has a true rig and the skeleton is another, its joints are scored too (``tasks.evaluation.joints``);
+    true joints count when they turn more than ``turn`` degrees from their parent somewhere.
+    """
+
+    def bones(piece: slice) -> np.ndarray:
+        return skin(skinning.rest, skinning.weights, skinning.transforms[piece])
+
+    def joints(piece: slice) -> np.ndarray:
+        rotations, shifts = poses.rotations[piece], poses.translations[piece]
+        transforms = kinematics.forward(skeleton.parents, skeleton.joints, rotations, shifts)
+        return skin(canonical.points, skeleton.weights, transforms)
+
+    diagonal = measure.diagonal(canonical.points)
+    bones_rmse, skeleton_rmse = _rmse_in_pieces(bones, train.points), _rmse_in_pieces(joints, train.points)
+    found = {
+        "bones_rmse": bones_rmse,
+        "bones_rmse_pct": 100.0 * bones_rmse / diagonal,
+        "bones_count": float(skinning.transforms.shape[1]),
+        "skeleton_rmse": skeleton_rmse,
+        "skeleton_rmse_pct": 100.0 * skeleton_rmse / diagonal,
+        "joints_count": float(len(skeleton.parents)),
+    }
+    if train.rig is not None and train.rig.names != skeleton.names:
+        found |= _against_truth(train.rig, canonical, skeleton, diagonal, turn)
+    return declared(found, train.unit)
+
+
+def _against_truth(
+    rig: Rig, canonical: Canonical, skeleton: Skeleton, diagonal: float, turn: float
+) -> dict[str, float]:
+    true_joints, true_parents = counting_joints(at_canonical(rig, canonical), turn)
+    if len(true_joints) == 0:
+        return {}
+    scores = joint_scores(skeleton.joints, skeleton.parents, true_joints, true_parents, diagonal)
+    return {name: scores[short] for short, name in _NAMED.items()}
+
+
+def at_canonical(rig: Rig, canonical: Canonical) -> Rig:
+    """The true rig with its joints where they are in the canonical shape, which may be a posed frame."""
+    if canonical.frame < 0:
+        return rig
+    frame = slice(canonical.frame, canonical.frame + 1)
+    transforms = kinematics.forward(rig.parents, rig.joints, rig.rotations[frame], rig.translations[frame])
+    joints = kinematics.joint_positions(transforms, rig.joints)[0]
+    return Rig(rig.names, rig.parents, joints, rig.weights, rig.rotations, rig.translations)
+
+
+def _rmse_in_pieces(make: Callable[[slice], np.ndarray], truth: np.ndarray) -> float:
+    """Vertex RMSE of a motion that is made a few frames at a time, so that it never lies in memory whole."""
+    pieces = [slice(a, min(a + FRAMES_AT_ONCE, len(truth))) for a in range(0, len(truth), FRAMES_AT_ONCE)]
+    return math.sqrt(np.concatenate([squared_errors(make(p), truth[p]).mean(1) for p in pieces]).mean())

@@ -40,6 +40,7 @@ def write(
     rows = join([_rows(p, refs, store) for p in planned])
     tables = _tables(planned, rows, settings)
     figures = [(node.cases[0], store.load(refs[node.id], "picture")) for node in pictures]
+    figures += _charts(rows, {p.case.method: p.case.config["animate"]["label"] for p in planned})
     folder = Path(settings["path"]).expanduser() / settings["name"]
     origin = provenance([p.case for p in planned], graph, refs, computed)
     report.write_report(folder, rows, tables, figures, origin)
@@ -87,6 +88,26 @@ def _tables(planned: list[Planned], rows, settings: dict) -> list:
     if rows["metric"].isin(TRUTH).any():
         tables.append(build(lead, title="Joints against the true rig", metrics=TRUTH, notes=[], **common))
     return tables
+
+
+def _charts(rows, labels: dict[str, str]) -> list:
+    """Errors by clip where methods are compared, changes by variant where one method is varied."""
+    from tasks.evaluation.charts import ablation_chart, clips_chart
+    from tasks.values import Picture
+
+    drawn = []
+    for method in dict.fromkeys(rows["method"]):
+        variants = rows.loc[rows["method"] == method, "variant"]
+        if variants.eq("").any() and variants.ne("").any():
+            chart = ablation_chart(rows, metric="rmse", method=method, labels=labels)
+            caption = f"{labels[method]}: change of the RMSE on unseen clips by each variant"
+            drawn.append((method, Picture("ablation", caption, None, chart)))
+    plain = rows[(rows["variant"] == "") & rows["metric"].str.startswith("rmse@")]
+    for (dataset, subject), group in plain.groupby(["dataset", "subject"], sort=False):
+        if group["method"].nunique() > 1:
+            chart = clips_chart(rows, metric="rmse", dataset=dataset, subject=subject, labels=labels)
+            drawn.append((dataset, Picture("clips", f"{subject}: RMSE on each unseen clip", None, chart)))
+    return drawn
 
 
 def _notes(planned: list[Planned], settings: dict) -> list[str]:

@@ -11,14 +11,15 @@ from types import ModuleType
 from typing import Literal
 
 import numpy as np
+from scipy.sparse import csr_matrix
 
 from tasks.datasets import creature_animal, creature_figure
 from tasks.datasets import creature_shape as shape
-from tasks.datasets.creature_dynamics import Masses, displace
+from tasks.datasets.creature_dynamics import Limbs, Masses, displace
 from tasks.datasets.creature_motion import Puppet
 from tasks.datasets.creature_soft import masses_of
 from tasks.errors import InputError
-from tasks.geometry import kinematics, rigid, skinning
+from tasks.geometry import kinematics, rigid
 from tasks.values import Motion, Rig
 
 SUBJECTS: dict[str, ModuleType] = {"animal": creature_animal, "figure": creature_figure}
@@ -51,6 +52,7 @@ def load(
     joints = np.array([at for _, at in tree.values()])
     parts = kind.parts()
     rest, faces = shape.build_surface(parts, vertices)
+    rest = rest.astype(np.float32).astype(np.float64)
     weights = skin_weights(kind, parts, rest, faces, names, parents).astype(np.float32)
     masses = soft_masses(kind, parts, rest, weights) if softness > 0 else []
     rng = np.random.default_rng(seed)
@@ -88,7 +90,7 @@ def skin_weights(
     weights = shape.hold_of_joints(parts, vertices, names, parents)
     if hasattr(kind, "drape"):
         weights = kind.drape(weights, vertices, parts, names)
-    return shape.smooth_weights(vertices, faces, weights, 0.02)
+    return shape.smooth_weights(vertices, faces, weights, 0.015)
 
 
 def soft_masses(kind: ModuleType, parts: list, vertices: np.ndarray, weights: np.ndarray) -> list[Masses]:
@@ -114,19 +116,20 @@ def deform(
 ) -> np.ndarray:  # fmt: skip
     """Linear blend skinning plus the swing of the soft parts, (F, N, 3) float32."""
     bones = kinematics.forward(parents, joints.astype(np.float32), rotations, translations)
-    points = skinning.skin(vertices.astype(np.float32), weights, bones)
+    # float64 and sparse: a dense product would change in the last bit with the number of BLAS threads
+    few, flat = csr_matrix(weights.astype(np.float64)), bones.astype(np.float64).reshape(len(bones), -1, 12)
+    points = np.stack([rigid.apply((few @ b).reshape(-1, 3, 4), vertices) for b in flat]).astype(np.float32)
     for m in masses:
-        ends, radii = capsules([p for p in parts if p.joint in m.avoid], names, bones)
+        limbs = limbs_of([p for p in parts if p.joint in m.avoid], names, bones)
         moved = np.flatnonzero(np.diff(m.spread.indptr))
         own = replace(m, spread=m.spread[moved])
-        points[:, moved] = displace(own, bones, points[:, moved], ends, radii, fps=FPS, softness=softness)
+        points[:, moved] = displace(own, bones, points[:, moved], limbs, fps=FPS, softness=softness)
     return points
 
 
-def capsules(picked: list, names: tuple[str, ...], bones: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Ends (F, C, 2, 3) and radii (C, 2) of parts that soft masses must stay out of, carried by their joints."""
-    ends = np.zeros((len(bones), len(picked), 2, 3))
+def limbs_of(picked: list, names: tuple[str, ...], bones: np.ndarray) -> Limbs:
+    """The capsules of parts that soft masses must stay out of, carried by their joints."""
+    rest = np.array([(p.a, p.b) for p in picked]).reshape(-1, 2, 3)
     radii = np.array([(p.ra, p.rb) for p in picked]).reshape(-1, 2)
-    for c, p in enumerate(picked):
-        ends[:, c] = rigid.apply(bones[:, None, names.index(p.joint)], np.array([p.a, p.b]))
-    return ends, radii
+    own = bones[:, [names.index(p.joint) for p in picked]].astype(np.float64)
+    return Limbs(rigid.apply(own[:, :, None], rest), rest, radii)

@@ -98,8 +98,8 @@ def soft() -> list[Lobe | Pad]:
     trunk = tuple(i for i, p in enumerate(body) if p.joint in ("spine", "chest", "pelvis"))
     back = ((0, 0.655, -0.47), (0, 0.65, -0.58), (0, 0.67, -0.74), (0, 0.715, -0.95))
     lobes: list[Lobe | Pad] = [
-        Pad(trunk, (0, 0.46, -0.07), (0.17, 0.15, 0.24), 2.2, 6.0, 0.18, 0.06, 0.06),
-        Lobe(tail, back, 9, 1.7, 6.0, 3.5, 0.3, 0.12),
+        Pad(trunk, (0, 0.46, -0.07), (0.17, 0.15, 0.26), 1.7, 5.0, 0.15, 0.06, 0.06),
+        Lobe(tail, back, 9, 1.7, 6.0, 3.5, 0.3, 0.2),
     ]
     for side, own in zip("lr", ears, strict=True):
         axis = (mirrored((0.055, 0.98, 0.42), side), mirrored((0.125, 1.155, 0.38), side))

@@ -44,20 +44,27 @@ class Masses:
     margin: float
 
 
+@dataclass(frozen=True)
+class Limbs:
+    """C capsules that masses stay out of. ends: (F, C, 2, 3), rest: (C, 2, 3) theirs at rest, radii: (C, 2)."""
+
+    ends: np.ndarray
+    rest: np.ndarray
+    radii: np.ndarray
+
+
 def displace(
     m: Masses,
     bones: np.ndarray,
     skin: np.ndarray,
-    limbs: np.ndarray,
-    radii: np.ndarray,
+    limbs: Limbs,
     *,
     fps: float,
     softness: float,
 ) -> np.ndarray:
     """The skin after the masses have swung, starting at rest in the first frame's pose.
 
-    bones: (F, J, 3, 4); skin: (F, N, 3) as linear blend skinning puts it; limbs: (F, C, 2, 3) ends of the capsules to
-    stay out of, radii: (C, 2) -> (F, N, 3) float32.
+    bones: (F, J, 3, 4); skin: (F, N, 3) as linear blend skinning puts it; -> (F, N, 3) float32.
     """
     blended = np.einsum("mj,fjab->fmab", m.hold, bones.astype(np.float64))
     goals = rigid.apply(blended, m.rest)
@@ -75,8 +82,9 @@ def displace(
         m.length,
         m.stretch**2,
         m.drag,
-        np.ascontiguousarray(limbs, np.float64),
-        radii + m.margin,
+        limbs.ends,
+        limbs.radii + m.margin,
+        slack(m, limbs),
         1.0 / (fps * SUBSTEPS),
         SUBSTEPS,
     )
@@ -96,6 +104,15 @@ def balance(m: Masses) -> np.ndarray:
     return -force
 
 
+def slack(m: Masses, limbs: Limbs) -> np.ndarray:
+    """(M, C) metres by which masses are inside the capsules at rest, margin included: where cloth meets the hip."""
+    a, axis = limbs.rest[:, 0], limbs.rest[:, 1] - limbs.rest[:, 0]
+    away = m.rest[:, None] - a
+    t = np.clip((away * axis).sum(2) / np.maximum((axis**2).sum(1), 1e-12), 0.0, 1.0)
+    radius = limbs.radii[:, 0] + t * (limbs.radii[:, 1] - limbs.radii[:, 0]) + m.margin
+    return np.maximum(radius - np.linalg.norm(away - t[..., None] * axis, axis=2), 0.0)
+
+
 def turns(path: np.ndarray, goals: np.ndarray, springs: np.ndarray) -> np.ndarray:
     """Rotations that best carry each mass's springs from goal to path, (F, M, 3, 3).
 
@@ -110,13 +127,13 @@ def turns(path: np.ndarray, goals: np.ndarray, springs: np.ndarray) -> np.ndarra
     for f in range(frames):
         h = (incidence @ (new[f, :, :, None] * old[f, :, None, :]).reshape(-1, 9)).reshape(-1, 3, 3)
         size = incidence @ (old[f] ** 2).sum(1)
-        out[f] = rotations.project_so3(h + 0.05 * size[:, None, None] * np.eye(3))
+        out[f] = rotations.project_so3(h + 0.02 * size[:, None, None] * np.eye(3))
     return out
 
 
 @njit(cache=True, nogil=True)
 def integrate(
-    goals, gravity, tie, damping, pinned, limit, springs, length, stretch, drag, limbs, radii, dt, substeps
+    goals, gravity, tie, damping, pinned, limit, springs, length, stretch, drag, limbs, radii, slack, dt, substeps
 ):  # fmt: skip
     """Positions of the masses at the frames, (F, M, 3); goals run along a cubic through the frames.
 
@@ -150,7 +167,7 @@ def integrate(
                     pushed = v[m, i] + dt * (force[m, i] + k * (next_goal[m, i] - x[m, i]) + c * pace)
                     v[m, i] = pushed / (1.0 + dt * c + dt * dt * k)
                     x[m, i] += dt * v[m, i]
-                keep_out(x[m], v[m], limb, next_limb, radii, dt)
+                keep_out(x[m], v[m], limb, next_limb, radii, slack[m], dt)
             goal[:] = next_goal
             limb[:] = next_limb
         out[f + 1] = x
@@ -188,7 +205,7 @@ def pull(x, v, springs, length, stretch, force):
 
 
 @njit(cache=True, nogil=True)
-def keep_out(x, v, before, after, radii, dt):
+def keep_out(x, v, before, after, radii, slack, dt):
     """Moves one mass out of the floor and of the capsules, and takes from its speed what runs into them."""
     if x[1] < 0.02:
         x[1] = 0.02
@@ -204,7 +221,7 @@ def keep_out(x, v, before, after, radii, dt):
         for i in range(3):
             far += (x[i] - a[i] - t * (b[i] - a[i])) ** 2
         far = np.sqrt(far) + 1e-12
-        depth = radii[c, 0] + t * (radii[c, 1] - radii[c, 0]) - far
+        depth = radii[c, 0] + t * (radii[c, 1] - radii[c, 0]) - slack[c] - far
         if depth <= 0.0:
             continue
         into = 0.0

@@ -137,8 +137,8 @@ class Puppet:
         away = np.linalg.norm(line, axis=1, keepdims=True)
         longest = l1 + l2
         # near full stretch the leg gives in softly instead of snapping straight
-        over = np.maximum(away / longest - 0.95, 0.0)
-        away, line = np.minimum(away, longest * (0.95 + 0.045 * (1 - np.exp(-over / 0.045)))), line / away
+        over = np.maximum(away / longest - 0.97, 0.0)
+        away, line = np.minimum(away, longest * (0.97 + 0.028 * (1 - np.exp(-over / 0.028)))), line / away
         along = (l1**2 - l2**2 + away**2) / (2 * away)
         side = (base @ pole) - line * np.sum((base @ pole) * line, axis=1, keepdims=True)
         side = side / np.linalg.norm(side, axis=1, keepdims=True)

@@ -36,7 +36,7 @@ class Cone:
     @property
     def softening(self) -> float:
         """Length in metres over which its hold on the skin fades."""
-        return 0.3 * min(self.ra, self.rb)
+        return 0.22 * min(self.ra, self.rb)
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Signed distance (a lower bound where squashed or steep). points: (N, 3) -> (N,)."""

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from tasks.bones import transforms, weights
 from tasks.bones.refit import rigid_transforms
+from tasks.bones.stray import trusted
 from tasks.bones.trajectories import Trajectories, compress
 from tasks.errors import InputError
 from tasks.geometry.measure import diagonal
@@ -48,8 +49,9 @@ def cluster(
     if max_bones < 1:
         raise InputError("bones.max_bones", expected="at least 1", found=str(max_bones))
     rng = np.random.default_rng(seed)
-    total = len(canonical.points)
-    sample = np.sort(rng.choice(total, min(total, _SAMPLE), replace=False))
+    sound = trusted(train.points, canonical.points, canonical.faces)
+    good = np.nonzero(sound)[0]
+    sample = np.sort(rng.choice(good, min(len(good), _SAMPLE), replace=False))
     extent = diagonal(canonical.points[sample])
     paths = compress(train.points, canonical.points, tolerance=_COMPRESSION * extent, sample=sample)
     part = paths.take(sample)
@@ -59,8 +61,8 @@ def cluster(
     if count == "auto":
         chosen = choose_count(counts, errors, len(sample), slack, floor)
         labels = _reassign(part, states[chosen], _POLISH)
-    found = _all_points(paths, part, labels)
-    return Clusters(found, rigid_transforms(train.points, canonical.points, found), counts, errors)
+    found = _all_points(paths, part, labels, sound)
+    return Clusters(found, rigid_transforms(train.points, canonical.points, found, sound), counts, errors)
 
 
 def choose_count(counts: np.ndarray, errors: np.ndarray, points: int, slack: float, floor: float) -> int:
@@ -181,7 +183,11 @@ def _pair_costs(k: np.ndarray, y: np.ndarray, gain: np.ndarray, a: int, others: 
     cost[np.minimum(a, others), np.maximum(a, others)] = together - gain[a] - gain[others]
 
 
-def _all_points(paths: Trajectories, part: Trajectories, labels: np.ndarray) -> np.ndarray:
-    """Labels of all points, (N,) int32, by the clusters of the sample; none is empty."""
-    found = weights.nearest_bone(paths, weights.forms(paths, _fit(part, labels)[2]))[0]
-    return _compact(found)
+def _all_points(paths: Trajectories, part: Trajectories, labels: np.ndarray, sound: np.ndarray) -> np.ndarray:
+    """Labels of all points, (N,) int32, by the clusters of the sample; each holds a point that is to be trusted."""
+    offsets = _fit(part, labels)[2]
+    found = weights.nearest_bone(paths, weights.forms(paths, offsets))[0]
+    kept = np.unique(found[sound])
+    if len(kept) < len(offsets):
+        found = weights.nearest_bone(paths, weights.forms(paths, offsets[kept]))[0]
+    return found

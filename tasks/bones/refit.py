@@ -38,12 +38,13 @@ def refit_bones(motion: Motion, skinning: Skinning) -> np.ndarray:
     return frame.to_world(offsets).astype(np.float32)
 
 
-def rigid_transforms(points: np.ndarray, canonical: np.ndarray, labels: np.ndarray) -> np.ndarray:
+def rigid_transforms(points: np.ndarray, canonical: np.ndarray, labels: np.ndarray, sound: np.ndarray) -> np.ndarray:
     """The best rigid motion of each group of points. points: (F, N, 3); canonical: (N, 3); labels: (N,) int32 in
-    0..B-1, each used -> (F, B, 3, 4) float32."""
+    0..B-1; sound: (N,) bool, the points that count, at least one in each group -> (F, B, 3, 4) float32."""
     count = int(labels.max()) + 1
     frame = _alignment(points, canonical)
-    k, y, _ = _raw_sums(points, canonical, frame, labels[:, None], np.ones((len(labels), 1)), count)
+    index = np.where(sound, labels, -1).astype(np.int32)[:, None]
+    k, y, _ = _raw_sums(points, canonical, frame, index, np.ones(index.shape), count)
     each = np.arange(count)
     return frame.to_world(transforms.rigid_fit(k[each, each], y)[0]).astype(np.float32)
 

@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from tasks.bones import transforms, weights
 from tasks.bones.clustering import split
 from tasks.bones.graph import Graph, moving_together
+from tasks.bones.stray import trusted
 from tasks.bones.trajectories import Trajectories, compress
 from tasks.errors import InputError
 from tasks.geometry.measure import vertex_rmse
@@ -63,8 +64,9 @@ def ssdr(
     """
     _check(influences, surplus, iterations, sample, prune)
     rng = np.random.default_rng(seed)
-    total = len(canonical.points)
-    chosen = np.sort(rng.choice(total, min(total, sample), replace=False))
+    sound = trusted(train.points, canonical.points, canonical.faces)
+    good = np.nonzero(sound)[0]
+    chosen = np.sort(rng.choice(good, min(len(good), sample), replace=False))
     paths = _paths(train, canonical, clusters, compression, chosen)
     part, wanted = paths.take(chosen), int(clusters.labels.max()) + 1
     bones = _start(part, clusters.labels[chosen], math.ceil(surplus * wanted), influences)
@@ -76,8 +78,8 @@ def ssdr(
     graph = moving_together(train.points, canonical.points, canonical.faces)
     near = cKDTree(part.rest[:, :3]).query(paths.rest[:, :3])[1]
     bones.index, bones.value = bones.index[near], bones.value[near]
-    history += _alternate(paths, bones, _FINISH, graph=graph, smoothness=smoothness, prune=prune)
-    k, y = transforms.sums(paths, bones.index, bones.value, wanted)
+    history += _alternate(paths, bones, _FINISH, graph=graph, sound=sound, smoothness=smoothness, prune=prune)
+    k, y = transforms.sums(paths, _counted(bones.index, sound), bones.value, len(bones.offsets))
     transforms.sweep(k, y, bones.offsets, _SETTLE)
     weights_of_points = _dense(bones)
     moved = paths.alignment.to_world(bones.offsets).astype(np.float32)
@@ -121,7 +123,7 @@ def _paths(
 def _start(part: Trajectories, labels: np.ndarray, count: int, influences: int) -> _Bones:
     """Rigid clusters, split further to the given count; every point follows its own."""
     labels = np.unique(labels, return_inverse=True)[1].reshape(-1).astype(np.int32)
-    labels = split(part, labels, min(count, len(labels) // 3), _LLOYD, _STILL * part.alignment.scale)
+    labels = split(part, labels, count, _LLOYD, _STILL * part.alignment.scale)
     index = np.full((len(labels), influences), -1, np.int32)
     value = np.zeros(index.shape)
     index[:, 0], value[:, 0] = labels, 1.0
@@ -136,6 +138,7 @@ def _alternate(
     rounds: int,
     *,
     graph: Graph | None = None,
+    sound: np.ndarray | None = None,
     smoothness: float = 0.0,
     prune: float = 0.0,
 ) -> list[float]:
@@ -151,12 +154,17 @@ def _alternate(
         exchanges = _FIRST_EXCHANGES if i == 0 else (i + 1) % 2
         weights.exchange(paths, forms, bones.index, bones.value, rounds=exchanges, smoothness=smoothness, graph=graph)
         _prune(bones, prune)
-        k, y = transforms.sums(paths, bones.index, bones.value, len(guess))
+        k, y = transforms.sums(paths, _counted(bones.index, sound), bones.value, len(guess))
         error = paths.rmse(paths.squared + transforms.sweep(k, y, guess, _SWEEPS))
         before, bones.offsets = bones.offsets, guess
         step = 0.0 if history and error > history[-1] else min(0.95, max(0.4, step + 0.1))
         history.append(error)
     return history
+
+
+def _counted(index: np.ndarray, sound: np.ndarray | None) -> np.ndarray:
+    """The weights that bones are fitted to: points that are not sound take part in none."""
+    return index if sound is None or sound.all() else np.where(sound[:, None], index, -1).astype(np.int32)
 
 
 def _remove(part: Trajectories, bones: _Bones, wanted: int) -> None:

@@ -48,14 +48,12 @@ RENAMED = {"lambda_": "lambda"}  # Python keywords that are the field's names in
 
 def load_function(kind: str) -> str:
     """The loader of a kind of dataset: ``tasks/datasets/<kind>.py``."""
-    choices("datasets", "dataset.kind", kind)
-    return f"tasks.datasets.{kind}:load"
+    return choices("datasets", "load", "dataset.kind", kind)
 
 
 def animate_function(function: str) -> str:
     """The method's function: ``tasks/methods/<function>.py``."""
-    choices("methods", "animate.function", function)
-    return f"tasks.methods.{function}:animate"
+    return choices("methods", "animate", "animate.function", function)
 
 
 def schema(config: dict) -> dict[str, object]:

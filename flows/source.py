@@ -111,8 +111,15 @@ def _without_docstrings(tree: ast.Module) -> ast.Module:
     return tree
 
 
-def choices(folder: str, what: str, name: str) -> None:
-    """Raises InputError unless ``tasks/<folder>/<name>.py`` exists."""
-    if not name.isidentifier() or not has(f"tasks.{folder}.{name}"):
-        known = sorted(p.stem for p in (ROOT / "tasks" / folder).glob("*.py") if not p.stem.startswith("_"))
-        raise InputError(what, expected=f"a module of tasks/{folder} ({', '.join(known)})", found=repr(name))
+def choices(folder: str, function: str, what: str, name: str) -> str:
+    """``tasks.<folder>.<name>:<function>``. Raises InputError, listing what there is, where there is none."""
+    known = sorted(
+        p.stem for p in (ROOT / "tasks" / folder).glob("*.py") if _defines(f"tasks.{folder}.{p.stem}", function)
+    )
+    if name not in known:
+        raise InputError(what, expected=f"one of {', '.join(known)}", found=repr(name))
+    return f"tasks.{folder}.{name}:{function}"
+
+
+def _defines(module: str, function: str) -> bool:
+    return any(isinstance(node, ast.FunctionDef) and node.name == function for node in _tree(module).body)

@@ -13,6 +13,7 @@ import json
 import threading
 import time
 from dataclasses import asdict, dataclass, field
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
@@ -120,7 +121,21 @@ class Watch:
             self.peak_mb = max(self.peak_mb, self._resident())
 
 
+@cache
+def one_blas_thread() -> None:
+    """Holds this process's BLAS to one thread: products of several threads differ in their last bits.
+
+    Stages run side by side instead, and their own kernels split work in ways that leave the bits alone.
+    """
+    import numpy  # noqa: F401
+    import scipy.linalg  # noqa: F401, both bring a BLAS of their own, which must be loaded to be held
+    from threadpoolctl import threadpool_limits
+
+    threadpool_limits(1, user_api="blas")
+
+
 def _compute(job: Job, store: Store) -> dict[str, object]:
+    one_blas_thread()
     module, name = job.function.split(":")
     function = getattr(importlib.import_module(module), name)
     kinds = source.annotations(job.function)

@@ -137,6 +137,7 @@ def skeleton_figure(
     sides = [_cameras(points[None], azimuth + turn)[0] for turn in (0.0, 0.5 * np.pi)]
     glass = {"opacity": 0.16, "rim": 0.5}
     pictures = [_panel(shape, side, points, CLAY * 0.9, lines, theme, joints, **glass) for side in sides]
+    pictures = _level(pictures, theme)
     if parts is None:
         return render.finish(np.hstack(pictures))
     names = [f"{len(skeleton.parents)} joints", *parts.names]
@@ -243,6 +244,19 @@ def _grid(pictures: list[np.ndarray], columns: int, theme: str) -> np.ndarray:
     empty = [render.blank(width, height, theme)] * (-len(pictures) % columns)
     every = [*pictures, *empty]
     return np.vstack([np.hstack(every[i : i + columns]) for i in range(0, len(every), columns)])
+
+
+def _level(pictures: list[np.ndarray], theme: str) -> list[np.ndarray]:
+    """Pictures of different heights with paper above and below, so that they can stand in a row."""
+    tallest = max(len(p) for p in pictures)
+    out = []
+    for picture in pictures:
+        room = np.empty((tallest, *picture.shape[1:]), np.uint8)
+        room[:] = render.to_bytes(render.PAPER[theme])
+        top = (tallest - len(picture)) // 2
+        room[top : top + len(picture)] = picture
+        out.append(room)
+    return out
 
 
 def _bar(height: int, colour: Callable, top: float, unit: str, theme: str, low: float = 0.0) -> np.ndarray:

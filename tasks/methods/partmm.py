@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from tasks.geometry.skinning import skin
-from tasks.motion.matching import match
+from tasks.motion.matching import Way, match
 from tasks.values import Animation, Poses, Training
 
 
@@ -21,6 +21,7 @@ def animate(
     represent: Literal["root", "part", "residual"],
     align: bool,
     dynamics: float,
+    shrink: bool,
 ) -> Animation:
     """Poses -> points by partwise motion matching (GaussiAnimate 3.3, eq. 7-10 and alg. 1), then skinning by W.
 
@@ -31,22 +32,14 @@ def animate(
     ``residual`` on what skinning of the skeleton predicts for them.
     align: turn matched bones to the query's joints by eq. 9, about the part's root joint (``root`` and ``part``).
     dynamics: weight of gravity, velocity, acceleration and angular velocity of the root in the key; 0 is the paper's.
+    shrink: take as much of each bone's residual as proved right when training clips were matched against each other
+    (``residual``).
 
     Clips of the query shorter than a patch are padded with their last pose. Raises InputError for poses of another
     skeleton, matrices that are no rotations, training clips all shorter than a patch and numbers out of range.
     """
-    found = match(
-        training,
-        query,
-        k=k,
-        patch=patch,
-        levels=levels,
-        lambda_=lambda_,
-        temperature=temperature,
-        represent=represent,
-        align=align,
-        dynamics=dynamics,
-    )
+    way = Way(k, patch, levels, lambda_, temperature, represent, align, dynamics, shrink)
+    found = match(training, query, way)
     points = skin(training.skinning.rest, training.skinning.weights, found.bones)
     return Animation(
         points=points, bones=found.bones, sources=found.sources, distance=found.distance, parts=training.parts.names

@@ -14,8 +14,44 @@ from tasks.motion.blending import Sources, blend, gather, strongest
 from tasks.motion.posed import Posed, relative
 from tasks.motion.projection import project
 from tasks.motion.query import check_poses
+from tasks.motion.regression import bone_radii, from_numbers, to_numbers
 from tasks.motion.search import nearest_windows
 from tasks.values import Poses, Training
+
+
+@dataclass(frozen=True)
+class Way:
+    """How to match, as :func:`tasks.methods.partmm.animate` explains it. Raises InputError for numbers out of range."""
+
+    k: int
+    patch: int
+    levels: int
+    lambda_: float
+    temperature: float
+    represent: Literal["root", "part", "residual"]
+    align: bool
+    dynamics: float
+    shrink: bool
+
+    def __post_init__(self) -> None:
+        for name, good, expected in (
+            ("k", self.k >= 1, "1 or more"),
+            ("patch", self.patch >= 1, "1 or more frames"),
+            ("levels", self.levels >= 1, "1 or more"),
+            ("lambda_", 0 < self.lambda_ <= 1, "a number in (0, 1]"),
+            ("temperature", self.temperature > 0, "a positive number"),
+            ("dynamics", self.dynamics >= 0, "0 (off) or a positive weight"),
+            ("represent", self.represent in ("root", "part", "residual"), "root, part or residual"),
+        ):
+            if not good:
+                raise InputError(f"animate.{name.rstrip('_')}", expected=expected, found=str(getattr(self, name)))
+        residual = self.represent == "residual"
+        if self.align and residual:
+            expected = "false with represent=residual (a residual is already seen from the posed skeleton)"
+            raise InputError("animate.align", expected=expected, found="true")
+        if self.shrink and not residual:
+            expected = "false without represent=residual (there is nothing to shrink towards)"
+            raise InputError("animate.shrink", expected=expected, found="true")
 
 
 @dataclass(frozen=True)
@@ -27,60 +63,84 @@ class Matched:
     distance: np.ndarray
 
 
-def match(
-    training: Training,
-    query: Poses,
-    *,
-    k: int,
-    patch: int,
-    levels: int,
-    lambda_: float,
-    temperature: float,
-    represent: Literal["root", "part", "residual"],
-    align: bool,
-    dynamics: float,
-) -> Matched:
+def match(training: Training, query: Poses, way: Way) -> Matched:
     """Bones for the query poses, matched and blended part by part (GaussiAnimate 3.3, eq. 7-10, alg. 1).
 
-    For the settings see :func:`tasks.methods.partmm.animate`. Raises InputError as that does.
+    Raises InputError for poses of another skeleton, matrices that are no rotations and training clips too short.
     """
-    _check(k, patch, levels, lambda_, temperature, represent, align, dynamics)
     check_poses(query, training.skeleton, "query")
     known = Posed(training, training.database.poses)
     longest = int(np.diff(known.poses.clip_start).max())
-    if longest < patch:
+    if longest < way.patch:
         expected = f"at most the {longest} frames of the longest training clip"
-        raise InputError("animate.patch", expected=expected, found=str(patch))
-    values = known.encode(training.database.bones, represent)
+        raise InputError("animate.patch", expected=expected, found=str(way.patch))
+    values = known.encode(training.database.bones, way.represent)
+    keep = _reliability(training, known, values, way) if way.shrink else None
     done = []
-    for a, b in pairwise(query.clip_start):
-        clip = Posed(training, _padded(query, int(a), int(b), patch))
-        frames = len(clip.world)
-        strides = _strides(min(frames, longest), patch, levels)
-        bones = np.zeros((frames, *values.shape[1:]))
-        sources, distance = [], []
-        for p in range(len(training.parts.names)):
-            found = nearest_windows(clip.keys(p, dynamics), known.keys(p, dynamics), k=k, patch=patch, strides=strides)
-            row = gather(found, strides, patch=patch, lambda_=lambda_, temperature=temperature)
-            _add_part(bones, p, row, values, clip, known, (represent, align))
-            sources.append(strongest(row, k))
-            distance.append(_per_frame(found.distance[-1, :, 0], frames, patch))
-        bones = clip.decode(rigid.make(project(bones[..., :3]), bones[..., 3]), represent)
-        done.append([x[: int(b - a)] for x in (bones, np.stack(sources, 1), np.stack(distance, 1))])
+    for clip in range(len(query.clip_start) - 1):
+        asked = Posed(training, _clip(query, clip, way.patch))
+        frames, sources, distance = _match_clip(asked, known, values, way)
+        if keep is not None:
+            frames = _shrunk(frames, keep)
+        length = int(query.clip_start[clip + 1] - query.clip_start[clip])
+        done.append([x[:length] for x in (asked.decode(frames, way.represent), sources, distance)])
     bones, sources, distance = (np.concatenate(x) for x in zip(*done, strict=True))
     return Matched(bones.astype(np.float32), sources, distance.astype(np.float32))
 
 
+def _match_clip(
+    asked: Posed, known: Posed, values: np.ndarray, way: Way, skip: int | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """One clip: frames of bones (F, B, 3, 4), sources (F, P, k), distance (F, P). skip: a training clip left out."""
+    frames = len(asked.world)
+    lengths = np.delete(np.diff(known.poses.clip_start), [] if skip is None else skip)
+    strides = _strides(min(frames, int(lengths.max())), way.patch, way.levels)
+    bones = np.zeros((frames, *values.shape[1:]))
+    sources, distance = [], []
+    for part in range(len(asked.training.parts.names)):
+        keys = asked.keys(part, way.dynamics), known.keys(part, way.dynamics)
+        found = nearest_windows(*keys, k=way.k, patch=way.patch, strides=strides, skip=skip)
+        row = gather(found, strides, patch=way.patch, lambda_=way.lambda_, temperature=way.temperature)
+        _add_part(bones, part, row, values, asked, known, way)
+        sources.append(strongest(row, way.k))
+        distance.append(_per_frame(found.distance[-1, :, 0], frames, way.patch))
+    return rigid.make(project(bones[..., :3]), bones[..., 3]), np.stack(sources, 1), np.stack(distance, 1)
+
+
+def _reliability(training: Training, known: Posed, values: np.ndarray, way: Way) -> np.ndarray:
+    """How much of a bone's matched residual to believe, (B,) in [0, 1].
+
+    Every training clip is matched against the others; the share is what brings the matched residuals closest to the
+    true ones in the least-squares sense. One clip alone, or clips too short to be matched, leave it at one.
+    """
+    poses, patch = training.database.poses, way.patch
+    lengths = np.diff(poses.clip_start)
+    radius = bone_radii(training.skinning.rest, training.skinning.weights)
+    unit = np.repeat([radius, np.ones_like(radius)], 3, axis=0).T
+    agree, size = np.zeros(len(unit)), np.zeros(len(unit))
+    for clip, (a, b) in enumerate(pairwise(poses.clip_start)):
+        if len(lengths) < 2 or np.delete(lengths, clip).max() < patch:
+            continue
+        asked = Posed(training, _clip(poses, clip, patch))
+        made = to_numbers(_match_clip(asked, known, values, way, skip=clip)[0])[: b - a] * unit
+        agree += (made * to_numbers(values[a:b]) * unit).sum((0, 2))
+        size += (made**2).sum((0, 2))
+    return np.where(size > 0, np.clip(agree / np.maximum(size, 1e-30), 0.0, 1.0), 1.0)
+
+
+def _shrunk(frames: np.ndarray, keep: np.ndarray) -> np.ndarray:
+    return from_numbers(to_numbers(frames) * keep[:, None])
+
+
 def _add_part(
-    bones: np.ndarray, part: int, row: Sources, values: np.ndarray, query: Posed, known: Posed, way: tuple[str, bool]
+    bones: np.ndarray, part: int, row: Sources, values: np.ndarray, asked: Posed, known: Posed, way: Way
 ) -> None:
     """Adds one part's blend to the bones that follow it, (F, B, 3, 4) in place, weighted by affinity."""
-    represent, align = way
-    affinity = query.training.parts.affinity[part]
+    affinity = asked.training.parts.affinity[part]
     follows = np.flatnonzero(affinity > 0)
-    mine = relative(values[:, follows], known.part_frame(part, represent))
-    mixed = blend(row, mine, query.part_motion(part, represent), known.part_motion(part, represent), align=align)
-    mixed = rigid.compose(query.part_frame(part, represent)[:, None], mixed)
+    mine = relative(values[:, follows], known.part_frame(part, way.represent))
+    joints = asked.part_motion(part, way.represent), known.part_motion(part, way.represent)
+    mixed = rigid.compose(asked.part_frame(part, way.represent)[:, None], blend(row, mine, *joints, align=way.align))
     bones[:, follows] += affinity[follows, None, None] * mixed
 
 
@@ -98,27 +158,8 @@ def _strides(frames: int, patch: int, levels: int) -> list[int]:
     return [2**level for level in range(count - 1, -1, -1)]
 
 
-def _padded(query: Poses, a: int, b: int, patch: int) -> Poses:
+def _clip(poses: Poses, clip: int, patch: int) -> Poses:
     """One clip; shorter ones than a patch hold their last pose."""
+    a, b = int(poses.clip_start[clip]), int(poses.clip_start[clip + 1])
     index = np.minimum(np.arange(a, max(b, a + patch)), b - 1)
-    return Poses(query.rotations[index], query.translations[index], np.array([0, len(index)], np.int64))
-
-
-def _check(k, patch, levels, lambda_, temperature, represent, align, dynamics) -> None:
-    for name, value, good, expected in (
-        ("k", k, k >= 1, "1 or more"),
-        ("patch", patch, patch >= 1, "1 or more frames"),
-        ("levels", levels, levels >= 1, "1 or more"),
-        ("lambda", lambda_, 0 < lambda_ <= 1, "a number in (0, 1]"),
-        ("temperature", temperature, temperature > 0, "a positive number"),
-        ("dynamics", dynamics, dynamics >= 0, "0 (off) or a positive weight"),
-        ("represent", represent, represent in ("root", "part", "residual"), "root, part or residual"),
-    ):
-        if not good:
-            raise InputError(f"animate.{name}", expected=expected, found=str(value))
-    if align and represent == "residual":
-        raise InputError(
-            "animate.align",
-            expected="false with represent=residual (a residual is already seen from the posed skeleton)",
-            found="true",
-        )
+    return Poses(poses.rotations[index], poses.translations[index], np.array([0, len(index)], np.int64))

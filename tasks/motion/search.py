@@ -47,10 +47,13 @@ class Matches:
     count: np.ndarray
 
 
-def nearest_windows(query: Keys, database: Keys, *, k: int, patch: int, strides: list[int]) -> Matches:
+def nearest_windows(
+    query: Keys, database: Keys, *, k: int, patch: int, strides: list[int], skip: int | None = None
+) -> Matches:
     """K nearest windows of ``patch`` frames, ``stride`` apart, none of which crosses a clip (GaussiAnimate eq. 8).
 
-    query: one clip; every stride must satisfy (patch - 1) stride < its frames. Ties go to the earlier window.
+    query: one clip; every stride must satisfy (patch - 1) stride < its frames. skip: a clip of the database that is
+    left out. Ties go to the earlier window.
     """
     frames = len(query.rotations)
     count = np.array([frames - (patch - 1) * s for s in strides], np.int64)
@@ -62,7 +65,7 @@ def nearest_windows(query: Keys, database: Keys, *, k: int, patch: int, strides:
 
     def block(first: int, last: int) -> None:
         rows = slice(first, min(last + reach, frames))
-        for a, b in pairwise(database.clip_start):
+        for a, b in (ab for clip, ab in enumerate(pairwise(database.clip_start)) if clip != skip):
             for c in range(int(a), int(b), DATABASE_BLOCK):
                 columns = slice(c, min(c + DATABASE_BLOCK + reach, int(b)))
                 tile = frame_distances(

@@ -26,6 +26,7 @@ PAPER = {
     "represent": "root",
     "align": True,
     "dynamics": 0.0,
+    "shrink": False,
 }
 WAYS = [
     PAPER,
@@ -218,6 +219,7 @@ def test_bad_poses_are_refused(train, method):
         ({"represent": "world"}, "animate.represent"),
         ({"represent": "residual"}, "animate.align"),
         ({"dynamics": -1.0}, "animate.dynamics"),
+        ({"shrink": True}, "animate.shrink"),
     ],
 )
 def test_bad_settings_are_refused(train, change, where):

@@ -1,0 +1,43 @@
+"""What regressing methods share: bones as six numbers, poses as features with a memory."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from tasks.geometry import rigid
+from tasks.geometry.rotations import from_rotation_vector, to_rotation_vector
+from tasks.motion.posed import Posed, centroids
+
+
+def to_numbers(frames: np.ndarray) -> np.ndarray:
+    """Frames of bones (F, B, 3, 4) -> (F, B, 6): rotation vector in radians, position."""
+    return np.concatenate([to_rotation_vector(frames[..., :3]), frames[..., 3]], axis=-1)
+
+
+def from_numbers(numbers: np.ndarray) -> np.ndarray:
+    """The inverse of :func:`to_numbers`."""
+    return rigid.make(from_rotation_vector(numbers[..., :3]), numbers[..., 3:])
+
+
+def features(posed: Posed, joints: np.ndarray, *, dynamics: float, lags: list[int]) -> np.ndarray:
+    """What a pose looks like to a regression, (F, D) float64.
+
+    The rotation matrices of the joints, divided by sqrt(2 n) so that distances are about the root mean square angle
+    between the poses in radians, and the root's dynamics, ``dynamics`` times as heavy as in matching; each of now and
+    of every lag (frames back; before a clip's first frame, that frame).
+    """
+    turns = posed.poses.rotations[:, joints].reshape(len(posed.world), -1).astype(np.float64)
+    now = np.concatenate([turns / np.sqrt(2 * len(joints)), dynamics * posed.dynamics.reshape(len(turns), -1)], axis=1)
+    back = [np.maximum(np.arange(b - a)[:, None] - np.array(lags), 0) + a for a, b in pairwise(posed.poses.clip_start)]
+    return now[np.concatenate(back)].reshape(len(now), -1) / np.sqrt(len(lags))
+
+
+def bone_radii(rest: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Root mean square distance of each bone's points from its centroid: what a radian of error is worth. (B,)."""
+    weights = weights.astype(np.float64)
+    mass = np.maximum(weights.sum(0), 1e-12)
+    centres = centroids(rest, weights)
+    apart = ((rest.astype(np.float64)[:, None] - centres) ** 2).sum(2)  # (N, B)
+    return np.sqrt(np.maximum((weights * apart).sum(0) / mass, 1e-12))

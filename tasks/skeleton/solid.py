@@ -4,38 +4,62 @@ from __future__ import annotations
 
 import igl
 import numpy as np
+from scipy.sparse import csr_matrix, diags_array, eye_array
 
 from tasks.errors import InputError
+from tasks.geometry.neighbours import adjacency
 from tasks.skeleton.manifold import components_of
+from tasks.skeleton.mend import mend
 
 _COARSE = 4  # fine cells along a coarse one
-_SWELL = (0.0, 1.0, 2.0, 4.0)  # cells that the border may move out to join parts or to thicken sheets
+# passes of smoothing and cells the border moves out, tried in this order: smoothing closes tunnels that single wrong
+# normals make, moving out joins parts and thickens sheets
+_ATTEMPTS = ((0, 0.0), (1, 0.0), (4, 0.0), (4, 0.5), (8, 0.5), (8, 1.0), (8, 2.0), (8, 4.0))
 _ENOUGH = 0.98  # of the points, in or near the component that is kept
+_PER_LOSS = 1000.0  # a handle, like a step down the list of attempts, weighs as much as one point in a thousand
 _CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
+_EDGES = [(a, b) for a in range(8) for b in range(a) if np.abs(_CORNERS[a] - _CORNERS[b]).sum() == 1]
 
 
 def border(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray, cells: int) -> tuple[np.ndarray, np.ndarray]:
     """The largest closed component round a soup of triangles -> vertices (V, 3), faces (T, 3).
 
     vertices: (S, 3); faces: (R, 3); points: (N, 3) that it should hold; cells: grid cells along the longest side.
-    Inside is where the winding number exceeds one half. Where that solid falls into parts or is too thin for the
-    grid, its border moves out, by up to four cells, until one part holds nearly all the points.
+    Inside is where the winding number exceeds one half. The signed distance is smoothed, and where the solid falls
+    into parts, is too thin for the grid or riddled with tunnels, its border moves out: as little as gives one part
+    that holds nearly all the points and has few handles.
     """
     size = float(np.ptp(points, axis=0).max()) / cells
     corners, cubes, distance = _sample(vertices, faces, points, size)
-    best, best_share = None, 0.0
-    for swell in _SWELL:
-        mesh = _largest(distance - swell * size, corners, cubes)
-        if mesh is None:
-            continue
-        share = _share(*mesh, points, 1.5 * size)
-        if share > best_share + 0.005:
-            best, best_share = mesh, share
-        if share >= _ENOUGH:
+    smooth = _averaging(cubes, len(corners))
+    best, best_score, passed = None, np.inf, 0
+    for attempt, (passes, swell) in enumerate(_ATTEMPTS):
+        if attempt >= best_score:
             break
+        for _ in range(passes - passed):
+            distance = smooth @ distance
+        passed = passes
+        mesh = _largest(distance - swell * size, corners, cubes)
+        if mesh is not None:
+            lost = max(0.0, _ENOUGH - _share(*mesh, points, 1.5 * size))
+            score = attempt + _handles(*mesh) + _PER_LOSS * lost
+            if score < best_score:
+                best, best_score = mesh, score
     if best is None:
         raise InputError("Canonical.points", expected="a shape that encloses a volume", found="none at this grid")
     return best
+
+
+def _averaging(cubes: np.ndarray, count: int) -> csr_matrix:
+    """Half the value of a corner and half the mean of its neighbours along the grid's edges."""
+    near = adjacency(np.concatenate([cubes[:, pair] for pair in _EDGES]), count)
+    degree = np.asarray(near.sum(axis=1)).ravel()
+    return (0.5 * eye_array(count) + 0.5 * diags_array(1.0 / degree) @ near).tocsr()
+
+
+def _handles(vertices: np.ndarray, faces: np.ndarray) -> float:
+    """Genus of one closed component, from Euler's formula V - E + T = 2 - 2 g."""
+    return 1.0 - (len(vertices) - 0.5 * len(faces)) / 2.0
 
 
 def _sample(
@@ -54,7 +78,7 @@ def _sample(
     mixed = sign[cubes].any(1) & ~sign[cubes].all(1)  # the border may span a hole, far from any triangle
     middle = low + (coarse + 0.5) * step
     squared, _, _ = igl.point_mesh_squared_distance(middle, vertices, faces)
-    reach = 0.5 * np.sqrt(3.0) * step + (_SWELL[-1] + 1.0) * size
+    reach = 0.5 * np.sqrt(3.0) * step + (_ATTEMPTS[-1][1] + 1.0) * size
     chosen = coarse[mixed | (squared < reach**2)]
     fine = (chosen[:, None] * _COARSE + _lattice(np.full(3, _COARSE))).reshape(-1, 3)
     corners, cubes = _cubes(fine, low, size)
@@ -88,8 +112,7 @@ def _largest(values: np.ndarray, corners: np.ndarray, cubes: np.ndarray) -> tupl
     number, part = components_of(faces, len(vertices))
     a, b, c = (vertices[faces[:, k]] - corners[0] for k in range(3))
     volume = np.bincount(part, np.einsum("ij,ij->i", a, np.cross(b, c)), minlength=number)
-    kept, renumbered = np.unique(faces[part == np.argmax(volume)], return_inverse=True)
-    return vertices[kept], renumbered.reshape(-1, 3)
+    return mend(vertices, faces[part == np.argmax(volume)])  # closed unless it ran out of the sampled cubes
 
 
 def _share(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray, near: float) -> float:

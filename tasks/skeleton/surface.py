@@ -35,6 +35,13 @@ def closed_surface(canonical: Canonical, *, vertices: int, cells: int, neighbour
         position, faces = remesh.to_count(position, faces, vertices)
     if _volume(position, faces) < 0:
         faces = faces[:, ::-1]
+    if not is_closed(faces, len(position)):
+        raise InputError(
+            "Canonical.points",
+            expected="a shape that a closed surface can be put round",
+            found="an open one",
+            do="try another skeleton.surface.cells",
+        )
     of_point = cKDTree(position).query(points)[1]
     return Surface(position.astype(np.float32), faces.astype(np.int32), of_point.astype(np.int32))
 
@@ -43,7 +50,7 @@ def _one_component(
     points: np.ndarray, faces: np.ndarray | None, cells: int, neighbours: int
 ) -> tuple[np.ndarray, np.ndarray]:
     if faces is None:
-        return solid.border(*orient.discs(points, neighbours), points, cells)
+        return solid.border(*orient.tangent_cells(points, neighbours), points, cells)
     faces = faces.astype(np.int64)
     if is_closed(faces, len(points)) and components_of(faces, len(points))[0] == 1:
         return points, faces

@@ -78,8 +78,7 @@ def outward_normals(points: np.ndarray, near: np.ndarray, reach: np.ndarray) -> 
     """
     offset = points[near] - points[near].mean(axis=1, keepdims=True)
     normal = np.linalg.eigh(np.einsum("nki,nkj->nij", offset, offset))[1][:, :, 0]
-    votes = [_flood(points, normal, ball * reach) for ball in _BALLS]
-    vote = votes[int(np.argmax([np.count_nonzero(v) for v in votes]))]
+    vote = _flood(points, normal, reach)
     others = near[:, 1:]
     way = points[others] - points[:, None]
     way /= np.maximum(np.linalg.norm(way, axis=2, keepdims=True), 1e-30)
@@ -93,17 +92,21 @@ def outward_normals(points: np.ndarray, near: np.ndarray, reach: np.ndarray) -> 
     return normal * np.where(side < 0, -1.0, 1.0)[:, None]
 
 
-def _flood(points: np.ndarray, normal: np.ndarray, radius: np.ndarray) -> np.ndarray:
+def _flood(points: np.ndarray, normal: np.ndarray, reach: np.ndarray) -> np.ndarray:
     """(N,) 1 where only the normal's side is reached from outside, -1 where only the other one is, else 0."""
     size = float(np.ptp(points, axis=0).max()) / _CELLS
-    radius = np.maximum(radius, 0.5 * np.sqrt(3.0) * size)  # a ball no cell slips through
-    margin = radius.max() + 2.0 * size
+    least = 0.5 * np.sqrt(3.0) * size  # a ball no cell slips through
+    margin = max(_BALLS[-1] * float(reach.max()), least) + 2.0 * size
     low = points.min(0) - margin
     shape = np.ceil((points.max(0) + margin - low) / size).astype(np.int64)
     middle = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1) + 0.5
     distance, nearest = cKDTree(points).query(low + middle * size)
-    part, _ = ndimage.label(distance > radius[nearest])
-    reached = part == part[0, 0, 0]
-    step = (radius + size)[:, None] * normal
-    fore, aft = (reached[tuple(((x - low) / size).astype(np.int64).T)] for x in (points + step, points - step))
-    return fore.astype(np.int64) - aft.astype(np.int64)
+    votes = []
+    for ball in _BALLS:
+        radius = np.maximum(ball * reach, least)
+        part, _ = ndimage.label(distance > radius[nearest])
+        reached = part == part[0, 0, 0]
+        step = (radius + size)[:, None] * normal
+        fore, aft = (reached[tuple(((x - low) / size).astype(np.int64).T)] for x in (points + step, points - step))
+        votes.append(fore.astype(np.int64) - aft.astype(np.int64))
+    return votes[int(np.argmax([np.count_nonzero(vote) for vote in votes]))]

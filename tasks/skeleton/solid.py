@@ -31,11 +31,13 @@ def border(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray, cells: i
     """
     size = float(np.ptp(points, axis=0).max()) / cells
     corners, cubes, distance = _sample(vertices, faces, points, size)
-    smooth = _averaging(cubes, len(corners))
+    smooth = None
     best, best_score, passed = None, np.inf, 0
     for attempt, (passes, swell) in enumerate(_ATTEMPTS):
         if attempt >= best_score:
             break
+        if passes > passed:
+            smooth = _averaging(cubes, len(corners)) if smooth is None else smooth
         for _ in range(passes - passed):
             distance = smooth @ distance
         passed = passes

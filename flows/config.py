@@ -10,6 +10,8 @@ import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
+from glob import glob, has_magic
+from pathlib import Path
 
 from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -36,6 +38,12 @@ class Case:
     method: str
     variant: str
     config: dict
+
+    @property
+    def data(self) -> str:
+        """The dataset with the file it reads, if it reads one: what tells subjects apart before they are loaded."""
+        path = self.config["dataset"].get("path")
+        return f"{self.dataset} {Path(path).stem}" if path else self.dataset
 
 
 def groups() -> dict[str, list[str]]:
@@ -83,7 +91,8 @@ def _sweep(overrides: list[Override], point: list[Override], compose_once, used:
     base, set_here = _set(compose_once(_group_overrides(choices)), values)
     used |= {text for text in set_here if text.startswith("sweep.")}
     sweep = schema.check(_plain(base)["sweep"], dict.fromkeys(SWEPT, list[str] | None), "sweep.")
-    label = ",".join(o.input_line.lstrip("+") for o in point if o.key_or_group != "seed")
+    unnamed = ("seed", "dataset", "dataset.path", "method")  # have columns of their own
+    label = ",".join(o.input_line.lstrip("+") for o in point if o.key_or_group not in unnamed)
     for dataset, method, ablation in itertools.product(*(sweep[axis] or [None] for axis in SWEPT)):
         chosen = {"dataset": dataset, "method": method} | choices  # what the user typed wins over the experiment
         if ablation and ablation != NO_ABLATION:
@@ -93,7 +102,20 @@ def _sweep(overrides: list[Override], point: list[Override], compose_once, used:
         config = _plain(composed)
         config = schema.check(config, schema.schema(config))
         variant = ",".join(filter(None, [ablation, label])) or NO_ABLATION
-        yield Case(chosen["dataset"] or config["dataset"]["kind"], config["animate"]["name"], variant, config)
+        name = chosen["dataset"] or config["dataset"]["kind"]
+        for node in _files(config["dataset"]):
+            yield Case(name, config["animate"]["name"], variant, config | {"dataset": node})
+
+
+def _files(dataset: dict) -> list[dict]:
+    """The dataset's node for every file that a path with wildcards stands for."""
+    path = dataset.get("path")
+    if not path or not has_magic(path) or Path(path).exists():
+        return [dataset]
+    found = sorted(glob(str(Path(path).expanduser())))
+    if not found:
+        raise InputError("dataset.path", expected="a file or folder", found=f"nothing that matches {path}")
+    return [dataset | {"path": one} for one in found]
 
 
 def _group_overrides(chosen: dict[str, str | None]) -> tuple[str, ...]:

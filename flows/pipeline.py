@@ -9,8 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from flows import schema
-from flows.config import Case
+from flows.config import NO_ABLATION, Case
 from flows.graph import Graph, Node
+
+Output = tuple[Node, str]  # a node and one of its outputs
 
 
 @dataclass(frozen=True)
@@ -20,58 +22,63 @@ class Planned:
     case: Case
     name: str
     metrics: tuple[Node, ...]
-    nodes: dict[str, tuple[Node, str]] = field(default_factory=dict)
+    nodes: dict[str, Output] = field(default_factory=dict)
 
 
 def plan(case: Case, graph: Graph) -> Planned:
-    """Adds a case's stages to the graph."""
+    """Adds a case's stages to the graph; ``pipeline: rig`` ends with the skeleton, ``animate`` with unseen poses."""
     config = case.config
-    seed = config["seed"]
-    name = f"{case.dataset} {case.method}" + (f" {case.variant}" if case.variant != "none" else "")
+    name = f"{case.data} {case.method}" + (f" {case.variant}" if case.variant != NO_ABLATION else "")
 
     def add(stage: str, function: str, node: dict, outputs: str, **inputs: object) -> Node:
-        settings = schema.arguments(function, node, seed)
+        settings = schema.arguments(function, node, config["seed"])
         path = settings.get("path") if stage == "dataset" else None
         return graph.add(stage, function, settings, outputs=tuple(outputs.split()), case=name, path=path, **inputs)
 
+    nodes = _rig(config, add)
+    shared = {n: nodes[n] for n in ("train", "canonical", "skinning", "skeleton", "poses")}
+    metrics = [add("evaluate", schema.EVALUATE_RIG, config["evaluate"], "metrics", **shared)]
+    if config["pipeline"] == "animate":
+        nodes |= _animation(config, add, nodes)
+        unseen = {n: nodes[n] for n in ("animation", "test", "canonical")}
+        metrics.append(add("evaluate", schema.EVALUATE, config["evaluate"], "metrics", **unseen))
+    return Planned(case, name, tuple(metrics), nodes)
+
+
+def _rig(config: dict, add) -> dict[str, Output]:
+    """Stages 1 to 3: data, bones, skeleton, parts."""
     data = config["dataset"]
     motion = add("dataset", schema.load_function(data["kind"]), data, "motion")["motion"]
     halves = add("split", schema.SPLIT, config["split"], "train test", motion=motion)
     train, test = halves["train"], halves["test"]
-    canonical_node = {"choice": config["skeleton"]["canonical"]}
-    canonical = add("canonical", schema.CANONICAL, canonical_node, "canonical", train=train)["canonical"]
+    choice = {"choice": config["skeleton"]["canonical"]}
+    canonical = add("canonical", schema.CANONICAL, choice, "canonical", train=train)["canonical"]
 
     bones = config["bones"]
     clusters = add("clusters", schema.CLUSTER, bones, "clusters", train=train, canonical=canonical)["clusters"]
     decompose = schema.SSDR if bones["kind"] == "ssdr" else schema.RIGID
-    skinning = add("bones", decompose, bones, "skinning", train=train, canonical=canonical, clusters=clusters)[
-        "skinning"
-    ]
+    fitted = add("bones", decompose, bones, "skinning", train=train, canonical=canonical, clusters=clusters)
+    skinning = fitted["skinning"]
 
     found = _skeleton(config["skeleton"], add, train, test, canonical, skinning)
-    skeleton = found["skeleton"]
-    database = add("database", schema.DATABASE, {}, "database", train=train, skinning=skinning, poses=found["poses"])
-    parts = add("parts", schema.PARTS, config["parts"], "parts", skeleton=skeleton, skinning=skinning)["parts"]
+    inputs = {"skeleton": found["skeleton"], "skinning": skinning}
+    parts = add("parts", schema.PARTS, config["parts"], "parts", **inputs)["parts"]
+    nodes = {"train": train, "test": test, "canonical": canonical, "clusters": clusters, "skinning": skinning}
+    return nodes | found | {"parts": parts}
 
-    training = {
-        "motion": train,
-        "canonical": canonical,
-        "skinning": skinning,
-        "skeleton": skeleton,
-        "database": database["database"],
-        "parts": parts,
-    }
+
+def _animation(config: dict, add, nodes: dict[str, Output]) -> dict[str, Output]:
+    """Stage 4: the database, and the method's answer to the unseen poses."""
+    inputs = {n: nodes[n] for n in ("train", "skinning", "poses")}
+    database = add("database", schema.DATABASE, {}, "database", **inputs)["database"]
+    training = {n: nodes[n] for n in ("canonical", "skinning", "skeleton", "parts")}
+    training |= {"motion": nodes["train"], "database": database}
     method = schema.animate_function(config["animate"]["function"])
-    animation = add("animate", method, config["animate"], "animation", training=training, query=found["query"])
-    unseen = {"animation": animation["animation"], "test": test, "canonical": canonical}
-    result = add("evaluate", schema.EVALUATE, config["evaluate"], "metrics", **unseen)
-    shared = {"train": train, "canonical": canonical, "skinning": skinning, "skeleton": skeleton}
-    rig = add("evaluate", schema.EVALUATE_RIG, config["evaluate"], "metrics", **shared, poses=found["poses"])
-    named = {"test": test, "clusters": clusters, "animation": animation["animation"]}
-    return Planned(case, name, (result, rig), named | found | training)
+    animation = add("animate", method, config["animate"], "animation", training=training, query=nodes["query"])
+    return {"animation": animation["animation"]}
 
 
-def _skeleton(settings: dict, add, train, test, canonical, skinning) -> dict[str, tuple[Node, str]]:
+def _skeleton(settings: dict, add, train, test, canonical, skinning) -> dict[str, Output]:
     """Stage 3: the data's own skeleton, or one found on the curve; poses of the training and of the unseen frames."""
     if settings["kind"] == "given":
         skeleton = add("skeleton", schema.GIVEN_SKELETON, {}, "skeleton", train=train, canonical=canonical)["skeleton"]
@@ -98,8 +105,8 @@ def _skeleton(settings: dict, add, train, test, canonical, skinning) -> dict[str
 def plan_pictures(planned: list[Planned], graph: Graph) -> list[Node]:
     """The figures of a report: for every dataset, its last case and the errors of up to four methods or variants."""
     found: list[Node] = []
-    for dataset in dict.fromkeys(p.case.dataset for p in planned):
-        cases = [p for p in planned if p.case.dataset == dataset]
+    for data in dict.fromkeys(p.case.data for p in planned):
+        cases = [p for p in planned if p.case.data == data]
         first = [p for p in cases if p.case.variant == cases[0].case.variant]
         shown = (first if len(first) > 1 else cases)[:4]
         found += _pictures(shown, graph)
@@ -109,21 +116,22 @@ def plan_pictures(planned: list[Planned], graph: Graph) -> list[Node]:
 def _pictures(shown: list[Planned], graph: Graph) -> list[Node]:
     lead = shown[-1]
 
-    def add(function: str, settings: dict, **inputs: object) -> Node:
+    def add(function: str, names: str, settings: dict | None = None, **inputs: object) -> Node:
         path = f"tasks.evaluation.pictures:{function}"
-        return graph.add("figures", path, settings, outputs=("picture",), case=lead.case.dataset, **inputs)
+        inputs |= {n: lead.nodes[n] for n in names.split()}
+        return graph.add("figures", path, settings or {}, outputs=("picture",), case=lead.case.data, **inputs)
 
-    def take(*names: str) -> dict:
-        return {n: lead.nodes["motion" if n == "train" else n] for n in names}
-
-    labels = [p.case.config["animate"]["label"] for p in shown]
-    if len(set(labels)) < len(labels):
-        labels = [p.case.variant for p in shown]
-    animations = {label: p.nodes["animation"] for label, p in zip(labels, shown, strict=True)}
-    return [
-        add("error_picture", {"focus": labels[-1]}, **take("test", "canonical"), animations=animations),
-        add("skeleton_picture", {}, **take("train", "canonical", "skeleton", "parts")),
-        add("parts_picture", {}, **take("train", "canonical", "skinning", "parts")),
-        add("bones_picture", {}, **take("train", "canonical", "skinning")),
-        add("count_picture", {}, **take("train", "canonical", "clusters")),
+    pictures = [
+        add("skeleton_picture", "train canonical skeleton parts"),
+        add("parts_picture", "train canonical skinning parts"),
+        add("bones_picture", "train canonical skinning"),
+        add("count_picture", "train canonical clusters"),
     ]
+    if "animation" in lead.nodes:
+        labels = [p.case.config["animate"]["label"] for p in shown]
+        if len(set(labels)) < len(labels):
+            labels = [p.case.variant for p in shown]
+        animations = {label: p.nodes["animation"] for label, p in zip(labels, shown, strict=True)}
+        errors = add("error_picture", "test canonical", {"focus": labels[-1]}, animations=animations)
+        pictures.insert(0, errors)
+    return pictures

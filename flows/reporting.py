@@ -40,6 +40,7 @@ def write(
     rows = join([_rows(p, refs, store) for p in planned])
     tables = _tables(planned, rows, settings)
     figures = [(node.cases[0], store.load(refs[node.id], "picture")) for node in pictures]
+    figures += _curve(planned, rows, settings["curve"])
     figures += _charts(rows, {p.case.method: p.case.config["animate"]["label"] for p in planned})
     folder = Path(settings["path"]).expanduser() / settings["name"]
     origin = provenance([p.case for p in planned], graph, refs, computed)
@@ -77,17 +78,36 @@ def _tables(planned: list[Planned], rows, settings: dict) -> list:
         "stands_for": {name: node["stands_for"] for name, node in datasets.items() if node["stands_for"]},
         "baselines": settings["baselines"],
     }
-    first = build(
-        rows, title=settings["title"], metrics=UNSEEN, notes=_notes(planned, settings),
-        paper=paper if settings["paper_table"] else None, paper_table=settings["paper_table"] or 0, **common,
-    )  # fmt: skip
-    motion = build(rows, title="Motion of the same results", metrics=MOTION, notes=[], **common)
+    tables = []
+    if rows["metric"].isin(UNSEEN).any():
+        printed = {"paper": paper, "paper_table": settings["paper_table"]} if settings["paper_table"] else {}
+        notes = _notes(planned, settings)
+        tables.append(build(rows, title=settings["title"], metrics=UNSEEN, notes=notes, **printed, **common))
+        tables.append(build(rows, title="Motion of the same results", metrics=MOTION, notes=[], **common))
     rig_notes = ["Bones and skeleton are shared by all methods; errors on the training frames they were fitted to."]
-    rig = build(lead, title="Bones and skeleton", metrics=RIG, notes=rig_notes, **common)
-    tables = [first, motion, rig]
+    tables.append(build(lead, title="Bones and skeleton", metrics=RIG, notes=rig_notes, **common))
     if rows["metric"].isin(TRUTH).any():
         tables.append(build(lead, title="Joints against the true rig", metrics=TRUTH, notes=[], **common))
     return tables
+
+
+def _curve(planned: list[Planned], rows, curve: list[str] | None) -> list:
+    """A metric against a key of the config, a line for every dataset."""
+    from tasks.evaluation.charts import curve_chart
+    from tasks.values import Picture
+
+    if not curve:
+        return []
+    key, metric = curve
+    where = {_variant(p): _at(p.case.config, key) for p in planned}
+    chart = curve_chart(rows, metric=metric, where=where, label=key)
+    return [("all", Picture("curve", f"{metric} against {key}", None, chart))]
+
+
+def _at(config: dict, key: str) -> float:
+    for part in key.split("."):
+        config = config[part]
+    return float(config)
 
 
 def _charts(rows, labels: dict[str, str]) -> list:
@@ -106,7 +126,9 @@ def _charts(rows, labels: dict[str, str]) -> list:
     for (dataset, subject), group in plain.groupby(["dataset", "subject"], sort=False):
         if group["method"].nunique() > 1:
             chart = clips_chart(rows, metric="rmse", dataset=dataset, subject=subject, labels=labels)
-            drawn.append((dataset, Picture("clips", f"{subject}: RMSE on each unseen clip", None, chart)))
+            drawn.append(
+                (f"{dataset}_{subject}", Picture("clips", f"{subject}: RMSE on each unseen clip", None, chart))
+            )
     return drawn
 
 

@@ -40,6 +40,7 @@ REPORT = {
     "figures": bool,
     "baselines": list[str],
     "paper_table": int | None,
+    "curve": list[str] | None,
     "note": str,
 }
 FROM_RUN = {"seed"}  # arguments that come from the top of the config
@@ -72,6 +73,7 @@ def schema(config: dict) -> dict[str, object]:
     bones |= settings(SSDR if config["bones"].get("kind") != "clusters" else RIGID)
     return {
         "seed": int,
+        "pipeline": Literal["animate", "rig"],
         "dataset": {
             "kind": str,
             "status": Literal["paper", "substitute"],

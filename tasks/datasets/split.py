@@ -18,13 +18,14 @@ LANDMARKS = 16  # points compared first when looking for equal frames
 
 
 def split(
-    motion: Motion, *, by: Literal["auto", "clips", "frames"], test: list[str], fraction: float
+    motion: Motion, *, by: Literal["auto", "clips", "frames"], test: list[str], fraction: float, observed: float
 ) -> tuple[Motion, Motion]:
     """(train, test), each contiguous run of frames a clip of its own, so that no window crosses a cut.
 
     by="clips": the clips named in `test`; when it is empty, :func:`choose_clips` picks about `fraction` of them.
     by="frames": the last `fraction` of every clip; `test` must be empty.
     by="auto": clips where there are several or some are named, else frames.
+    observed: share of the training frames that is kept, from the first on (the paper's fig. 9); the test stays.
 
     Frames at which the test repeats a training frame (clips often start from one neutral pose) are left out of the
     test. Raises InputError when that takes more than half of a test clip (by="frames": of all test frames), when either
@@ -38,7 +39,19 @@ def split(
         if test:
             raise InputError("split.test", expected="no names when split.by=frames", found=_list(test))
         train, held = _by_frames(motion, fraction)
-    return train, _without_repeats(train, held, each_clip=by == "clips")
+    test_motion = _without_repeats(train, held, each_clip=by == "clips")
+    return _prefix(train, observed), test_motion
+
+
+def _prefix(train: Motion, share: float) -> Motion:
+    """The first frames of the training motion, at least two."""
+    if not 0 < share <= 1:
+        raise InputError("split.observed", expected="a number above 0, at most 1", found=str(share))
+    stop = max(2, round(share * train.frames))
+    if stop >= train.frames:
+        return train
+    runs = [slice(c.start, min(c.stop, stop)) for c in train.clips() if c.start < stop]
+    return train.take_frames(runs, list(train.clip_names[: len(runs)]))
 
 
 def choose_clips(motion: Motion, count: int) -> list[int]:

@@ -52,5 +52,20 @@ def clips_chart(rows: pd.DataFrame, *, metric: str, dataset: str, subject: str, 
     return plot.dots(names, series, x=f"{METRICS[metric].label} [{chosen['unit'].iloc[0]}]")
 
 
+def curve_chart(rows: pd.DataFrame, *, metric: str, where: Mapping[str, float], label: str) -> str:
+    """A metric against a setting that the variants differ in, a line for every subject, and their mean.
+
+    where: variant -> value of the setting; label: the setting's name. Means over seeds and methods.
+    """
+    chosen = rows[rows["metric"] == metric].assign(x=rows["variant"].map(where))
+    table = chosen.pivot_table(index="x", columns=["dataset", "subject"], values="value", aggfunc="mean", sort=True)
+    x = table.index.to_numpy(float)
+    series = [plot.Series(str(subject), x, table[dataset, subject].to_numpy()) for dataset, subject in table.columns]
+    if len(series) > 1:
+        mean = plot.Series("mean", x, table.mean(axis=1).to_numpy())
+        series = [mean] if len(series) > len(plot.COLOURS) - 1 else [mean, *series]
+    return plot.lines(series, x=label, y=METRICS[metric].label)
+
+
 def _label(labels: Mapping[str, str], name: str) -> str:
     return labels.get(name, name.rpartition("/")[2])

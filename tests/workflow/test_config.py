@@ -114,6 +114,17 @@ def test_a_dataset_on_the_command_line_replaces_the_experiments():
     assert [c.method for c in cases] == ["lbs", "fullmm", "partmm"]
 
 
+def test_wildcards_are_one_case_a_file(tmp_path):
+    for name in ("b.npz", "a.npz"):
+        (tmp_path / name).write_bytes(b"")
+    cases = config.expand(["+experiment=table3", "dataset=mesh_sequence", f"dataset.path={tmp_path}/*.npz"])
+    assert len(cases) == 6
+    assert {c.data for c in cases} == {"mesh_sequence a", "mesh_sequence b"}
+    assert {c.variant for c in cases} == {"none"}
+    with pytest.raises(InputError, match="nothing that matches"):
+        config.expand(["dataset=mesh_sequence", f"dataset.path={tmp_path}/*.obj"])
+
+
 def test_a_whole_number_may_stand_for_a_number_and_nothing_else_is_converted():
     expected = {"a": float, "b": int | None, "c": list[str]}
     assert schema.check({"a": 1, "b": None, "c": []}, expected) == {"a": 1.0, "b": None, "c": []}

@@ -120,7 +120,8 @@ def _cross_squared(a, b, c):
 
 @njit(cache=True, nogil=True)
 def _cotangents(mesh, weight):
-    """weight[h]: half the cotangents on both sides of the edge; those of obtuse angles count as zero."""
+    """weight[h]: sum of the cotangents on both sides of the edge; those of obtuse angles count as zero, so that no
+    vertex can leave the hull of its neighbours, its pole and its place."""
     for t in range(mesh.used[1]):
         for h in range(3 * t, 3 * t + 3):
             if mesh.origin[h] < 0:

@@ -16,7 +16,7 @@ _COARSE = 4  # fine cells along a coarse one
 # normals make, moving out joins parts and thickens sheets
 _ATTEMPTS = ((0, 0.0), (1, 0.0), (4, 0.0), (4, 0.5), (8, 0.5), (8, 1.0), (8, 2.0), (8, 4.0))
 _ENOUGH = 0.98  # of the points, in or near the component that is kept
-_PER_LOSS = 1000.0  # a handle, like a step down the list of attempts, weighs as much as one point in a thousand
+_PER_HANDLE, _PER_LOSS = 2.0, 1000.0  # in steps down the list of attempts: a handle, and all points lost
 _CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
 _EDGES = [(a, b) for a in range(8) for b in range(a) if np.abs(_CORNERS[a] - _CORNERS[b]).sum() == 1]
 
@@ -44,7 +44,7 @@ def border(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray, cells: i
         mesh = _largest(distance - swell * size, corners, cubes)
         if mesh is not None:
             lost = max(0.0, _ENOUGH - _share(*mesh, points, 1.5 * size))
-            score = attempt + _handles(*mesh) + _PER_LOSS * lost
+            score = attempt + _PER_HANDLE * _handles(*mesh) + _PER_LOSS * lost
             if score < best_score:
                 best, best_score = mesh, score
     if best is None:

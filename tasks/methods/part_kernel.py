@@ -11,7 +11,7 @@ from tasks.geometry.skinning import skin
 from tasks.motion import kernel
 from tasks.motion.posed import Posed
 from tasks.motion.query import check_poses
-from tasks.motion.regression import bone_radii, features, from_numbers, to_numbers
+from tasks.motion.regression import features, from_numbers, shape_units, to_numbers
 from tasks.values import Animation, Poses, Training
 
 
@@ -50,7 +50,7 @@ def animate(
     check_poses(query, training.skeleton, "query")
     known, asked = Posed(training, training.database.poses), Posed(training, query)
     numbers = to_numbers(known.encode(training.database.bones, represent))
-    unit = _units(training)
+    unit = shape_units(training)
     past = [lag * i for i in range(lags + 1)]
     made = np.zeros((len(asked.world), *numbers.shape[1:]))
     for part, affinity in enumerate(training.parts.affinity):
@@ -63,11 +63,3 @@ def animate(
     bones = asked.decode(from_numbers(made), represent).astype(np.float32)
     points = skin(training.skinning.rest, training.skinning.weights, bones)
     return Animation(points=points, bones=bones, parts=training.parts.names)
-
-
-def _units(training: Training) -> np.ndarray:
-    """(B, 6): what makes an error in a bone's six numbers an error of its points: its radius for turns, and the root of
-    its share of the shape for all, so that tuning minds what is seen."""
-    radius = bone_radii(training.skinning.rest, training.skinning.weights)
-    share = np.sqrt(training.skinning.weights.astype(np.float64).mean(0) + 1e-12)
-    return share[:, None] * np.repeat([radius, np.ones_like(radius)], 3, axis=0).T

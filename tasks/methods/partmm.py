@@ -30,7 +30,8 @@ def animate(
     temperature: of the softmax over windows, in units of the best window's distance.
     represent: what bones are stored relative to: the model's ``root`` (the paper), the ``part``'s root joint, or as a
     ``residual`` on what skinning of the skeleton predicts for them.
-    align: turn matched bones to the query's joints by eq. 9, about the part's root joint (``root`` and ``part``).
+    align: turn matched bones to the query's joints by eq. 9, about the part's root joint. Residuals are seen from the
+    posed skeleton already: nothing is left to align.
     dynamics: weight of gravity, velocity, acceleration and angular velocity of the root in the key; 0 is the paper's.
     shrink: take as much of each bone's residual as proved right when training clips were matched against each other
     (``residual``).

@@ -45,11 +45,7 @@ class Way:
         ):
             if not good:
                 raise InputError(f"animate.{name.rstrip('_')}", expected=expected, found=str(getattr(self, name)))
-        residual = self.represent == "residual"
-        if self.align and residual:
-            expected = "false with represent=residual (a residual is already seen from the posed skeleton)"
-            raise InputError("animate.align", expected=expected, found="true")
-        if self.shrink and not residual:
+        if self.shrink and self.represent != "residual":
             expected = "false without represent=residual (there is nothing to shrink towards)"
             raise InputError("animate.shrink", expected=expected, found="true")
 
@@ -139,8 +135,9 @@ def _add_part(
     affinity = asked.training.parts.affinity[part]
     follows = np.flatnonzero(affinity > 0)
     mine = relative(values[:, follows], known.part_frame(part, way.represent))
+    align = way.align and way.represent != "residual"
     joints = asked.part_motion(part, way.represent), known.part_motion(part, way.represent)
-    mixed = rigid.compose(asked.part_frame(part, way.represent)[:, None], blend(row, mine, *joints, align=way.align))
+    mixed = rigid.compose(asked.part_frame(part, way.represent)[:, None], blend(row, mine, *joints, align=align))
     bones[:, follows] += affinity[follows, None, None] * mixed
 
 

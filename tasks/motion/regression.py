@@ -9,6 +9,7 @@ import numpy as np
 from tasks.geometry import rigid
 from tasks.geometry.rotations import from_rotation_vector, to_rotation_vector
 from tasks.motion.posed import Posed, centroids
+from tasks.values import Training
 
 
 def to_numbers(frames: np.ndarray) -> np.ndarray:
@@ -41,3 +42,11 @@ def bone_radii(rest: np.ndarray, weights: np.ndarray) -> np.ndarray:
     centres = centroids(rest, weights)
     apart = ((rest.astype(np.float64)[:, None] - centres) ** 2).sum(2)  # (N, B)
     return np.sqrt(np.maximum((weights * apart).sum(0) / mass, 1e-12))
+
+
+def shape_units(training: Training) -> np.ndarray:
+    """(B, 6): what makes an error in a bone's six numbers an error of its points: its radius for turns, and the root of
+    its share of the shape for all, so that tuning minds what is seen."""
+    radius = bone_radii(training.skinning.rest, training.skinning.weights)
+    share = np.sqrt(training.skinning.weights.astype(np.float64).mean(0) + 1e-12)
+    return share[:, None] * np.repeat([radius, np.ones_like(radius)], 3, axis=0).T

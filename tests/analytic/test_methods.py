@@ -217,7 +217,6 @@ def test_bad_poses_are_refused(train, method):
         ({"lambda_": 0.0}, "animate.lambda"),
         ({"temperature": 0.0}, "animate.temperature"),
         ({"represent": "world"}, "animate.represent"),
-        ({"represent": "residual"}, "animate.align"),
         ({"dynamics": -1.0}, "animate.dynamics"),
         ({"shrink": True}, "animate.shrink"),
     ],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -12,9 +13,12 @@ from tasks.geometry.kinematics import forward
 from tasks.geometry.measure import vertex_rmse
 from tasks.geometry.rotations import from_rotation_vector
 from tasks.geometry.skinning import skin
-from tasks.methods import lbs, lbs_fitted, lbs_residual, part_kernel, partmm
-from tasks.motion import kernel
+from tasks.methods import bone_response, lbs, lbs_fitted, lbs_residual, part_kernel, partmm
+from tasks.motion import kernel, response
+from tasks.motion.dynamics import root_dynamics
 from tasks.motion.fitting import _onto_simplex
+from tasks.motion.posed import Posed
+from tasks.values import Poses
 from tests.analytic import planted
 
 A, B, C = planted.gesture(60, 1), planted.gesture(80, 2), planted.gesture(50, 3)
@@ -193,3 +197,58 @@ def test_bad_poses_are_refused(train):
     ):
         with pytest.raises(InputError, match="rotation matrices"):
             animate()
+
+
+RESPONSE = {"lag": 2, "lags": 8, "pose": False, "width": 1.0, "ridge": 0.1, "landmarks": 1000}
+
+
+def swinging(train, query: Poses) -> np.ndarray:
+    """True bones that ride on the skeleton but lag behind: shifted by a filter of their place's acceleration."""
+    posed = Posed(train, query)
+    frames = np.zeros_like(posed.predicted)
+    frames[..., :3] = np.eye(3)
+    for b in range(frames.shape[1]):
+        moving = root_dynamics(posed.predicted[:, b], np.zeros(3), query.clip_start, train.database.fps)[:, 2]
+        for start, stop in pairwise(query.clip_start):
+            for back, gain in ((0, -4e-4), (2, -2e-4), (6, 1e-4)):
+                index = np.maximum(np.arange(start, stop) - back, start)
+                frames[start:stop, b, :, 3] += gain * moving[index]
+    return posed.decode(frames, "residual").astype(np.float32)
+
+
+def test_the_answer_to_being_shaken_carries_over_to_motions_unlike_any_seen(train):
+    bones = swinging(train, train.database.poses)
+    points = skin(train.skinning.rest, train.skinning.weights, bones)
+    soft = replace(
+        train,
+        motion=replace(train.motion, points=points),
+        skinning=replace(train.skinning, transforms=bones),
+        database=replace(train.database, bones=bones),
+    )
+    query = planted.poses([planted.gesture(60, 9)])
+    true = skin(train.skinning.rest, train.skinning.weights, swinging(train, query))
+    answered = vertex_rmse(bone_response.animate(soft, query, **RESPONSE).points, true)
+    assert answered < 0.2 * vertex_rmse(lbs_residual.animate(soft, query).points, true)
+    assert answered < 0.2 * vertex_rmse(partmm.animate(soft, query, **PLUS).points, true)
+
+
+def test_a_response_that_left_out_clips_do_not_confirm_is_dropped():
+    rng = np.random.default_rng(3)
+    x, y, start = rng.normal(size=(60, 50)), rng.normal(size=(60, 2)), np.array([0, 20, 40, 60])
+    filters, left_out = response.fit(x, 1e-6 * y, start)
+    assert np.all(filters == 0)
+    assert np.all(left_out == 0)
+    true = rng.normal(size=(50, 2))
+    filters, left_out = response.fit(x, x @ true, start)
+    assert np.abs(filters - true).max() < 0.2
+    np.testing.assert_allclose(
+        left_out[:20],
+        x[:20] @ np.linalg.solve(x[20:].T @ x[20:] + 0.1 * np.eye(50), x[20:].T @ (x[20:] @ true)),
+        atol=1e-8,
+    )
+
+
+@pytest.mark.parametrize("change", [{"lag": 0}, {"lags": -1}, {"width": 0.0}, {"ridge": 0.0}, {"landmarks": 1}])
+def test_bad_settings_of_the_response_are_refused(train, change):
+    with pytest.raises(InputError, match=f"animate.{next(iter(change))}"):
+        bone_response.animate(train, planted.poses([A]), **RESPONSE | change)

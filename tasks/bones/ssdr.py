@@ -24,7 +24,7 @@ from tasks.geometry.measure import vertex_rmse
 from tasks.geometry.skinning import skin
 from tasks.values import Canonical, Clusters, Motion, Skinning
 
-_SPAN = 1000  # points from which the basis of all paths is taken
+_SPAN = 1000  # points from which the basis of all paths is taken, and the fewest that a fit is made on
 _SWEEPS = 2  # Gauss-Seidel sweeps a round: more bring nothing
 _SETTLE = 6  # sweeps at the end, on frozen weights
 _LLOYD = 4  # reassignments after each split of the start
@@ -45,8 +45,9 @@ def ssdr(
     influences: int,
     surplus: float,
     iterations: int,
-    sample: int,
+    points_per_bone: int,
     smoothness: float,
+    locality: float,
     compression: float,
     prune: float,
     seed: int,
@@ -54,37 +55,39 @@ def ssdr(
     """Weights W (N, B) and rigid transforms T (F, B, 3, 4) that minimise sum |sum_b w_nb T_fb v_n - x_fn|^2.
 
     influences: most bones a point may have; surplus: bones to start with, as a multiple of those wanted;
-    iterations: rounds once the surplus is gone; sample: points that take part until the last rounds;
+    iterations: rounds once the surplus is gone; points_per_bone: points that take part until the last rounds;
     smoothness: weight of the squared difference to the neighbours' mean weights, against squared errors relative to
-    the shape's radius; compression: error allowed to the compressed paths, as a fraction of the clusters' own error;
-    prune: weights below are removed in the last rounds. B is the number of clusters. Cost: linear in N and in F.
+    the shape's radius; locality: pull to near bones, sum_b w_nb |v_n - centre_b|^2 (in radii) per degree of evidence,
+    i.e. times the clusters' squared error over F: few frames need it, many hardly feel it; compression: error allowed
+    to the compressed paths, as a fraction of the clusters' own error; prune: weights below are removed in the last
+    rounds. B is the number of clusters. Points that move like nothing around them get weights but do not move bones.
+    Cost: linear in N and in F.
     history: vertex RMSE after every round, of the sample first, the last exactly that of the result.
     Raises InputError for settings out of range. Source: Le & Deng, SIGGRAPH Asia 2012, eq. 2-8, solved as described in
     the modules named above.
     """
-    _check(influences, surplus, iterations, sample, prune)
+    _check(influences, surplus, iterations, points_per_bone, prune)
     rng = np.random.default_rng(seed)
     sound = trusted(train.points, canonical.points, canonical.faces)
     good = np.nonzero(sound)[0]
-    chosen = np.sort(rng.choice(good, min(len(good), sample), replace=False))
-    paths = _paths(train, canonical, clusters, compression, chosen)
-    part, wanted = paths.take(chosen), int(clusters.labels.max()) + 1
+    wanted = int(clusters.labels.max()) + 1
+    size = min(len(good), max(_SPAN, points_per_bone * wanted))
+    chosen = np.sort(rng.choice(good, size, replace=False))
+    coarse = _clusters_error(train, canonical, clusters, chosen)
+    paths = compress(train.points, canonical.points, tolerance=compression * coarse, sample=_thinned(chosen))
+    near_first = locality * (coarse / paths.alignment.scale) ** 2 / train.frames
+    part = paths.take(chosen)
     bones = _start(part, clusters.labels[chosen], math.ceil(surplus * wanted), influences)
-    history = _alternate(part, bones, _WARM_UP)
+    history = _alternate(part, bones, _WARM_UP, locality=near_first)
     while len(bones.offsets) > wanted:
         _remove(part, bones, wanted)
-        history += _alternate(part, bones, _BETWEEN)
-    history += _alternate(part, bones, iterations)
-    graph = moving_together(train.points, canonical.points, canonical.faces)
-    near = cKDTree(part.rest[:, :3]).query(paths.rest[:, :3])[1]
-    bones.index, bones.value = bones.index[near], bones.value[near]
-    history += _alternate(paths, bones, _FINISH, graph=graph, sound=sound, smoothness=smoothness, prune=prune)
-    k, y = transforms.sums(paths, _counted(bones.index, sound), bones.value, len(bones.offsets))
-    transforms.sweep(k, y, bones.offsets, _SETTLE)
-    weights_of_points = _dense(bones)
+        history += _alternate(part, bones, _BETWEEN, locality=near_first)
+    history += _alternate(part, bones, iterations, locality=near_first)
+    history += _finish(train, canonical, paths, part, bones, sound, near_first, smoothness, prune)
+    shares = _dense(bones)
     moved = paths.alignment.to_world(bones.offsets).astype(np.float32)
-    reached = vertex_rmse(skin(canonical.points, weights_of_points, moved), train.points)
-    return Skinning(canonical.points.astype(np.float32), weights_of_points, moved, np.append(history, reached))
+    reached = vertex_rmse(skin(canonical.points, shares, moved), train.points)
+    return Skinning(canonical.points.astype(np.float32), shares, moved, np.append(history, reached))
 
 
 @dataclass
@@ -96,8 +99,9 @@ class _Bones:
     offsets: np.ndarray
 
 
-def _check(influences: int, surplus: float, iterations: int, sample: int, prune: float) -> None:
-    for name, found, least in (("influences", influences, 1), ("iterations", iterations, 0), ("sample", sample, 100)):
+def _check(influences: int, surplus: float, iterations: int, points_per_bone: int, prune: float) -> None:
+    ranges = (("influences", influences, 1), ("iterations", iterations, 0), ("points_per_bone", points_per_bone, 6))
+    for name, found, least in ranges:
         if found < least:
             raise InputError(f"bones.{name}", expected=f"at least {least}", found=str(found))
     if not surplus >= 1.0:
@@ -106,18 +110,19 @@ def _check(influences: int, surplus: float, iterations: int, sample: int, prune:
         raise InputError("bones.prune", expected="at least 0 and below 1 / influences", found=str(prune))
 
 
-def _paths(
-    train: Motion, canonical: Canonical, clusters: Clusters, compression: float, chosen: np.ndarray
-) -> Trajectories:
-    """Paths compressed as far as the clusters' error, judged on some of the points, allows."""
-    chosen = chosen[:: math.ceil(len(chosen) / _SPAN)]
+def _thinned(chosen: np.ndarray) -> np.ndarray:
+    return chosen[:: math.ceil(len(chosen) / _SPAN)]
+
+
+def _clusters_error(train: Motion, canonical: Canonical, clusters: Clusters, chosen: np.ndarray) -> float:
+    """Vertex RMSE of the rigid clusters on some of the points: the scale against which other errors are small."""
+    chosen = _thinned(chosen)
     rest, labels = canonical.points[chosen].astype(np.float64), clusters.labels[chosen]
     total = 0.0
     for t, x in zip(clusters.transforms, train.points, strict=True):
         moved = np.einsum("nij,nj->ni", t[labels][..., :3].astype(np.float64), rest) + t[labels][..., 3]
         total += float(np.sum((moved - x[chosen]) ** 2))
-    tolerance = compression * np.sqrt(total / (len(chosen) * train.frames))
-    return compress(train.points, canonical.points, tolerance=tolerance, sample=chosen)
+    return float(np.sqrt(total / (len(chosen) * train.frames)))
 
 
 def _start(part: Trajectories, labels: np.ndarray, count: int, influences: int) -> _Bones:
@@ -140,6 +145,7 @@ def _alternate(
     graph: Graph | None = None,
     sound: np.ndarray | None = None,
     smoothness: float = 0.0,
+    locality: float = 0.0,
     prune: float = 0.0,
 ) -> list[float]:
     """Rounds of weights and transforms, in place. Returns the vertex RMSE after each.
@@ -152,7 +158,17 @@ def _alternate(
         guess = transforms.extrapolate(bones.offsets, before, step) if step > 0 else bones.offsets.copy()
         forms = weights.forms(paths, guess)
         exchanges = _FIRST_EXCHANGES if i == 0 else (i + 1) % 2
-        weights.exchange(paths, forms, bones.index, bones.value, rounds=exchanges, smoothness=smoothness, graph=graph)
+        weights.exchange(
+            paths,
+            forms,
+            bones.index,
+            bones.value,
+            rounds=exchanges,
+            smoothness=smoothness,
+            graph=graph,
+            locality=locality,
+            centres=_centres(paths, bones),
+        )
         _prune(bones, prune)
         k, y = transforms.sums(paths, _counted(bones.index, sound), bones.value, len(guess))
         error = paths.rmse(paths.squared + transforms.sweep(k, y, guess, _SWEEPS))
@@ -160,6 +176,45 @@ def _alternate(
         step = 0.0 if history and error > history[-1] else min(0.95, max(0.4, step + 0.1))
         history.append(error)
     return history
+
+
+def _finish(
+    train: Motion,
+    canonical: Canonical,
+    paths: Trajectories,
+    part: Trajectories,
+    bones: _Bones,
+    sound: np.ndarray,
+    locality: float,
+    smoothness: float,
+    prune: float,
+) -> list[float]:
+    """From the sample to all points: each starts with the weights of the sample's nearest point."""
+    near = cKDTree(part.rest[:, :3]).query(paths.rest[:, :3])[1]
+    bones.index, bones.value = bones.index[near], bones.value[near]
+    history = _alternate(
+        paths,
+        bones,
+        _FINISH,
+        graph=moving_together(train.points, canonical.points, canonical.faces),
+        sound=sound,
+        smoothness=smoothness,
+        locality=locality,
+        prune=prune,
+    )
+    k, y = transforms.sums(paths, _counted(bones.index, sound), bones.value, len(bones.offsets))
+    transforms.sweep(k, y, bones.offsets, _SETTLE)
+    return history
+
+
+def _centres(paths: Trajectories, bones: _Bones) -> np.ndarray:
+    """(B, 3) mean position of each bone's points, by weight, in aligned coordinates."""
+    count = len(bones.offsets)
+    owner, share = np.where(bones.index >= 0, bones.index, count).ravel(), bones.value.ravel()
+    total = np.bincount(owner, share, minlength=count + 1)[:count]
+    place = np.repeat(paths.rest[:, :3], bones.index.shape[1], axis=0)
+    each = [np.bincount(owner, share * place[:, d], minlength=count + 1)[:count] for d in range(3)]
+    return np.stack(each, axis=1) / np.maximum(total, 1e-300)[:, None]
 
 
 def _counted(index: np.ndarray, sound: np.ndarray | None) -> np.ndarray:

@@ -68,11 +68,14 @@ def exchange(
     rounds: int,
     smoothness: float,
     graph: Graph | None,
+    locality: float,
+    centres: np.ndarray,
 ) -> np.ndarray:
     """Improves sparse weights in place; returns each point's squared error, (N,) mean over frames.
 
     index: (N, S) int32, -1 for an empty place; value: (N, S) float64; rounds: exchanges tried, 0 keeps the support;
-    smoothness: weight of |w - mean of the neighbours' w|^2; graph: see :mod:`tasks.bones.graph`.
+    smoothness: weight of |w - mean of the neighbours' w|^2; graph: see :mod:`tasks.bones.graph`;
+    locality: weight of sum_b w_b |h - centre_b|^2, centres: (B, 3): far bones are for what near ones cannot explain.
     """
     error = np.empty(len(index))
     last = (index.copy(), value.copy())  # neighbours' weights are those of the round before, for any order of points
@@ -92,6 +95,8 @@ def exchange(
             smoothness,
             graph,
             last,
+            locality,
+            centres,
             start,
             stop,
         )
@@ -173,7 +178,24 @@ def _nearest_bone(rest, path, frames, linear, square, label, error, start, stop)
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _exchange(rest, path, frames, linear, square, index, value, error, rounds, smoothness, graph, last, start, stop):
+def _exchange(
+    rest,
+    path,
+    frames,
+    linear,
+    square,
+    index,
+    value,
+    error,
+    rounds,
+    smoothness,
+    graph,
+    last,
+    locality,
+    centres,
+    start,
+    stop,
+):
     count, slots = len(square), index.shape[1]
     raw, correlation = np.empty((_TILE, 4 * count)), np.empty((_TILE, count))
     energy, hh = np.empty(_TILE), np.empty(10)
@@ -191,6 +213,10 @@ def _exchange(rest, path, frames, linear, square, index, value, error, rounds, s
             _products_of(rest[n], hh)
             if smoothness > 0.0:
                 _pull(n, graph, last, smoothness, c)
+            if locality > 0.0:
+                for b in range(count):
+                    x, y, z = rest[n, 0] - centres[b, 0], rest[n, 1] - centres[b, 1], rest[n, 2] - centres[b, 2]
+                    c[b] -= 0.5 * locality * (x * x + y * y + z * z)
             size = 0
             for s in range(slots):
                 if index[n, s] >= 0:

@@ -21,8 +21,9 @@ SSDR = {
     "influences": 4,
     "surplus": 1.6,
     "iterations": 20,
-    "sample": 4000,
+    "points_per_bone": 80,
     "smoothness": 0.0,
+    "locality": 0.0,
     "compression": 0.01,
     "prune": 0.0,
     "seed": 0,
@@ -173,7 +174,8 @@ def test_nearest_rotation_against_singular_values(kind: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("setting", "value"), [("influences", 0), ("iterations", -1), ("surplus", 0.5), ("sample", 0), ("prune", 0.5)]
+    ("setting", "value"),
+    [("influences", 0), ("iterations", -1), ("surplus", 0.5), ("points_per_bone", 0), ("prune", 0.5)],
 )
 def test_settings_out_of_range_are_named(setting: str, value: float) -> None:
     rng = np.random.default_rng(9)

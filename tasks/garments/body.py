@@ -1,4 +1,4 @@
-"""The body that wears the garments: Anny (Apache-2.0, its data CC0), standing in its rest pose, +Y up, facing +Z, on the ground y = 0."""
+"""The body that wears the garments: Anny (Apache-2.0, its data CC0) at rest, +Y up, facing +Z, soles at y = 0."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ DIGITS = ("Thumb", "Index", "Middle", "Ring", "Pinky")  # these follow their han
 
 
 def anny_body(*, gender: float, age: float, muscle: float, weight: float, height: float, proportions: float) -> Motion:
-    """The body as a motion of one frame, its rest pose, with the `mixamo` rig, fingers merged into the hands: 22 joints.
+    """The body as a motion of one frame, its rest pose, with the `mixamo` rig, fingers merged into hands: 22 joints.
 
     The settings are Anny's phenotypes, each 0..1. Only the skin is kept (no eyes, teeth or tongue). The first start of
     Anny takes minutes and leaves a cache of some 800 MB.
@@ -21,7 +21,8 @@ def anny_body(*, gender: float, age: float, muscle: float, weight: float, height
     import torch
 
     model = anny.Anny(rig="mixamo")
-    phenotype = dict(gender=gender, age=age, muscle=muscle, weight=weight, height=height, proportions=proportions)
+    labels = ("gender", "age", "muscle", "weight", "height", "proportions")
+    phenotype = dict(zip(labels, (gender, age, muscle, weight, height, proportions), strict=True))
     with torch.no_grad():
         out = model(phenotype_kwargs={name: torch.tensor([value]) for name, value in phenotype.items()})
     vertices = _upright(out["rest_vertices"][0].numpy())

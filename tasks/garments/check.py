@@ -35,8 +35,9 @@ class Quality:
 
 def quality(body: Motion, poses: Poses, points: np.ndarray, rest: np.ndarray, faces: np.ndarray, fps: float) -> Quality:
     """points: (F, N, 3) the cloth at the poses' frames; rest: (N, 3) its stress-free shape."""
+    hard = collision_faces(body)
     return Quality(
-        depth=np.stack([depth_in(skin, collision_faces(body), p) for skin, p in zip(body_points(body, poses), points)]),
+        depth=np.stack([depth_in(skin, hard, p) for skin, p in zip(body_points(body, poses), points, strict=True)]),
         strain=strain(points, rest, faces),
         speed=np.linalg.norm(np.diff(points, axis=0), axis=2) * fps,
     )

@@ -1,6 +1,6 @@
 """Garments cut from the body: a level set of the distance to the body, opened at neck, sleeves and hem, remeshed.
 
-All is done on the body with its arms level, so that sleeves, side seams and hem are cut by planes. The shape as cut is
+All is done on the body with its arms lifted, so that sleeves, side seams and hem are cut by planes. The shape as cut is
 the cloth's stress-free shape.
 """
 
@@ -16,15 +16,15 @@ from tasks.geometry import kinematics
 from tasks.geometry.skinning import skin
 from tasks.values import Canonical, Motion, Poses
 
-ARMS_LEVEL = 85.0  # degrees off the body
+ARMS_LIFTED = 65.0  # degrees off the body: clear of it, yet no more cloth in the armpit than hanging arms can fold
 GRID = 0.01  # metres
 BLUR = 1.2  # grid cells: cloth spans hollows of the skin
 SECTORS = 72  # directions in which the skirt's width is measured
 
 
 def cutting_pose(body: Motion) -> Poses:
-    """The pose, one frame, in which garments are cut: standing, arms level."""
-    world = zero_pose(body, spread=ARMS_LEVEL)[None]
+    """The pose, one frame, in which garments are cut: standing, arms lifted."""
+    world = zero_pose(body, spread=ARMS_LIFTED)[None]
     return to_poses(body.rig.parents, world, np.zeros((1, 3)))
 
 
@@ -164,7 +164,7 @@ def collapse_short(points: np.ndarray, faces: np.ndarray, shortest: float) -> tu
                 break
         else:
             return compact(points, faces)
-        points[a] = points[a] if rim[a] and not rim[b] else points[b] if rim[b] and not rim[a] else points[[a, b]].mean(0)
+        points[a] = points[[v for v in (a, b) if rim[v] or rim[a] == rim[b]]].mean(0)  # the rim stays where it is
         faces[faces == b] = a
         faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
 

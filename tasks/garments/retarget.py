@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tasks.errors import InputError
-from tasks.garments.capture import LINKS, Capture, heading_of
+from tasks.garments.capture import LINKS, Capture, heading_of, read
 from tasks.geometry import kinematics
 from tasks.geometry.rotations import from_rotation_vector, to_rotation_vector
 from tasks.values import Motion, Poses
@@ -35,6 +35,24 @@ for _side in ("left", "right"):
 ARMS = ("Arm", "ForeArm", "Hand")
 ROOT_HEIGHT = 0.89  # of DeepMimic's root when it stands, in metres
 LEAD = 0.12  # seconds in which the lead-in takes up the clip's first velocity
+
+
+def motion_clip(
+    body: Motion,
+    *,
+    clip: str,
+    cycles: float,
+    turn: float,
+    slow: float,
+    fps: float,
+    spread: float,
+    stand: float,
+    speed: float,
+) -> Poses:
+    """A motion of the body from pybullet's wheel, lead-in and clip: :func:`tasks.garments.capture.read`, then
+    :func:`retarget`, then :func:`lead_in` from standing with arms `stand` degrees off the body."""
+    capture = read(clip=clip, cycles=cycles, fps=fps, turn=turn, slow=slow)
+    return lead_in(body, retarget(body, capture, spread=spread), spread=stand, fps=fps, speed=speed)
 
 
 def retarget(body: Motion, capture: Capture, *, spread: float) -> Poses:
@@ -75,8 +93,9 @@ def to_poses(parents: np.ndarray, world: np.ndarray, shift: np.ndarray) -> Poses
     return Poses(local.astype(np.float32), moved.astype(np.float32), np.array([0, len(world)]))
 
 
-def lead_in(body: Motion, poses: Poses, *, spread: float, fps: float, speed: float) -> tuple[Poses, int]:
-    """The poses with a lead-in from standing, and its number of frames. The lead-in ends with the clip's own velocity.
+def lead_in(body: Motion, poses: Poses, *, spread: float, fps: float, speed: float) -> Poses:
+    """The poses with a lead-in from standing before them, which ends with their own velocity. It is two clips:
+    the lead-in, in which the cloth finds its way and which is no data, and the poses.
 
     spread: degrees that the arms stand off when standing; speed: metres a second that no joint should much exceed,
     which sets the lead-in's length.
@@ -101,13 +120,10 @@ def lead_in(body: Motion, poses: Poses, *, spread: float, fps: float, speed: flo
     place[:, 1] *= ease
     shift = np.zeros((count, *poses.translations.shape[1:]))
     shift[:, 0] = place
-    return (
-        Poses(
-            np.concatenate([rotations, poses.rotations]).astype(np.float32),
-            np.concatenate([shift, poses.translations]).astype(np.float32),
-            np.array([0, count + len(poses.rotations)]),
-        ),
-        count,
+    return Poses(
+        np.concatenate([rotations, poses.rotations]).astype(np.float32),
+        np.concatenate([shift, poses.translations]).astype(np.float32),
+        np.array([0, count, count + len(poses.rotations)]),
     )
 
 

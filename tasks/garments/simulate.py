@@ -37,7 +37,9 @@ def collision_faces(body: Motion) -> np.ndarray:
 def body_points(body: Motion, poses: Poses) -> np.ndarray:
     """The posed body, (F, V, 3)."""
     rig = body.rig
-    return skin(body.rest, rig.weights, kinematics.forward(rig.parents, rig.joints, poses.rotations, poses.translations))
+    return skin(
+        body.rest, rig.weights, kinematics.forward(rig.parents, rig.joints, poses.rotations, poses.translations)
+    )
 
 
 def simulate(
@@ -96,6 +98,41 @@ def simulate(
         if not np.isfinite(cloth.points).all():
             raise FloatingPointError(f"the cloth exploded at frame {frame}")
         yield cloth
+
+
+def simulate_chunk(
+    body: Motion,
+    garment: Canonical,
+    poses: Poses,
+    cloth: Cloth,
+    *,
+    first: int,
+    count: int,
+    fps: float,
+    substeps: int,
+    iterations: int,
+    density: float,
+    stretch: float,
+    bend: float,
+    damping: float,
+    contact: float,
+    friction: float,
+    thickness: float,
+    drag: float,
+) -> tuple[Motion, Cloth]:
+    """`count` frames from `first` on as a motion of the cloth, and the state after the last, for a cached stage.
+
+    cloth: the state at frame first - 1; the other settings as in :func:`simulate`.
+    """
+    settings = {"density": density, "stretch": stretch, "bend": bend, "damping": damping, "contact": contact}
+    settings |= {"friction": friction, "thickness": thickness, "drag": drag}
+    stepping = simulate(
+        body, garment, poses, cloth, first=first, fps=fps, substeps=substeps, iterations=iterations, **settings
+    )
+    done = [cloth for _, cloth in zip(range(count), stepping, strict=False)]
+    points = np.stack([state.points for state in done])
+    name = garment.source.split()[0]
+    return Motion(name, points, garment.faces, np.array([0, len(points)]), (name,), fps, "m", garment.points), done[-1]
 
 
 def carried(cloth: Cloth, body: Motion, poses: Poses) -> Cloth:

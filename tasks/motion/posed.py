@@ -44,6 +44,7 @@ class Posed:
         )
         self.model = relative(self.world, self.world[:, self.root])
         self.centres = centroids(skinning.rest, skinning.weights)
+        self._keys: dict[tuple[int, float], Keys] = {}
 
     @cached_property
     def quaternions(self) -> np.ndarray:
@@ -75,11 +76,12 @@ class Posed:
         return np.flatnonzero(inner if inner.any() else joints)
 
     def keys(self, part: int, dynamics: float) -> Keys:
-        """What windows of a part are compared by."""
-        extra = (
-            (dynamics * self.dynamics).astype(np.float32) if dynamics > 0 else np.zeros((len(self.world), 0, 3), "f4")
-        )
-        return Keys(self.quaternions[:, self.key_joints(part)], extra, self.poses.clip_start)
+        """What windows of a part are compared by; made once."""
+        if (part, dynamics) not in self._keys:
+            extra = dynamics * self.dynamics if dynamics > 0 else np.zeros((len(self.world), 0, 3))
+            turns = self.quaternions[:, self.key_joints(part)]
+            self._keys[part, dynamics] = Keys(turns, extra.astype(np.float32), self.poses.clip_start)
+        return self._keys[part, dynamics]
 
     def part_frame(self, part: int, represent: str) -> np.ndarray:
         """(F, 3, 4) the frame, seen from the model's root, that a part's bones are stored in."""

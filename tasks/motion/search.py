@@ -9,6 +9,7 @@ arcsine faster than chordal candidates with an exact second pass.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -32,6 +33,11 @@ class Keys:
     def scale(self) -> int:
         """Number of joints: distances are divided by it."""
         return self.rotations.shape[1]
+
+    @cached_property
+    def columns(self) -> tuple[np.ndarray, np.ndarray]:
+        """(J, 4, F) and (E, 3, F): frames innermost, for vector units."""
+        return tuple(np.ascontiguousarray(x.transpose(1, 2, 0)) for x in (self.rotations, self.extra))
 
 
 @dataclass(frozen=True)
@@ -59,18 +65,14 @@ def nearest_windows(
     count = np.array([frames - (patch - 1) * s for s in strides], np.int64)
     distance = np.full((len(strides), count.max(), k), np.inf, np.float32)
     start = np.full((len(strides), count.max(), k), -1, np.int32)
-    keys = np.ascontiguousarray(database.rotations.transpose(1, 2, 0))  # (J, 4, F): frames innermost, for vector units
-    extra = np.ascontiguousarray(database.extra.transpose(1, 2, 0))
     reach = (patch - 1) * max(strides)
 
     def block(first: int, last: int) -> None:
         rows = slice(first, min(last + reach, frames))
         for a, b in (ab for clip, ab in enumerate(pairwise(database.clip_start)) if clip != skip):
             for c in range(int(a), int(b), DATABASE_BLOCK):
-                columns = slice(c, min(c + DATABASE_BLOCK + reach, int(b)))
-                tile = frame_distances(
-                    query.rotations[rows], query.extra[rows], keys[:, :, columns], extra[:, :, columns]
-                )
+                columns = c, min(c + DATABASE_BLOCK + reach, int(b))
+                tile = frame_distances(query.rotations[rows], query.extra[rows], database, *columns)
                 for level, stride in enumerate(strides):
                     windows = slice(first, min(last, int(count[level])))
                     starts = min(c + DATABASE_BLOCK, int(b) - (patch - 1) * stride) - c
@@ -82,16 +84,17 @@ def nearest_windows(
     return Matches(distance, start, count)
 
 
-def frame_distances(rotations: np.ndarray, extra: np.ndarray, keys: np.ndarray, key_extra: np.ndarray) -> np.ndarray:
+def frame_distances(rotations: np.ndarray, extra: np.ndarray, database: Keys, first: int, last: int) -> np.ndarray:
     """Sum over joints of the angle between the rotations of two frames, for all pairs of frames.
 
-    rotations: (T, J, 4); keys: (J, 4, F); extra: (T, E, 3) and key_extra: (E, 3, F), whose Euclidean distances are
-    added J times, so that their share does not depend on the number of joints -> (T, F) float32, radians.
+    rotations: (T, J, 4); extra: (T, E, 3), whose Euclidean distances are added J times, so that their share does not
+    depend on the number of joints; against frames first:last of the database -> (T, last - first) float32, radians.
     """
-    out = np.zeros((len(rotations), keys.shape[2]), np.float32)
-    _add_angles(np.ascontiguousarray(rotations), keys, out)
+    out = np.zeros((len(rotations), last - first), np.float32)
+    keys, key_extra = database.columns
+    _add_angles(np.ascontiguousarray(rotations), keys, first, out)
     if extra.shape[1]:
-        _add_extra(np.ascontiguousarray(extra), key_extra, np.float32(rotations.shape[1]), out)
+        _add_extra(np.ascontiguousarray(extra), key_extra, first, np.float32(rotations.shape[1]), out)
     return out
 
 
@@ -99,18 +102,19 @@ _FAST = {"contract", "nnan", "ninf", "nsz"}  # lets the loops over frames use ve
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
-def _add_angles(rotations: np.ndarray, keys: np.ndarray, out: np.ndarray) -> None:
+def _add_angles(rotations: np.ndarray, keys: np.ndarray, first: int, out: np.ndarray) -> None:
     """angle = 4 asin(|q -+ k| / 2): exact near zero, where the arccosine of a dot product is not.
 
     With w = |q -+ k|^2 / 4 in [0, 1/2] it is 4 sqrt(w) P(w), P a Chebyshev interpolant of asin(sqrt w) / sqrt w,
     right to 6e-8 radians.
     """
-    quarter, four = np.float32(0.25), np.float32(4.0)
+    quarter, four, last = np.float32(0.25), np.float32(4.0), first + out.shape[1]
     for t in range(len(rotations)):
         row = out[t]
         for j in range(rotations.shape[1]):
             a, b, c, d = rotations[t, j, 0], rotations[t, j, 1], rotations[t, j, 2], rotations[t, j, 3]
-            ka, kb, kc, kd = keys[j, 0], keys[j, 1], keys[j, 2], keys[j, 3]
+            ka, kb = keys[j, 0][first:last], keys[j, 1][first:last]
+            kc, kd = keys[j, 2][first:last], keys[j, 3][first:last]
             for u in range(len(row)):
                 minus = (a - ka[u]) ** 2 + (b - kb[u]) ** 2 + (c - kc[u]) ** 2 + (d - kd[u]) ** 2
                 plus = (a + ka[u]) ** 2 + (b + kb[u]) ** 2 + (c + kc[u]) ** 2 + (d + kd[u]) ** 2
@@ -127,12 +131,13 @@ def _add_angles(rotations: np.ndarray, keys: np.ndarray, out: np.ndarray) -> Non
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
-def _add_extra(extra: np.ndarray, keys: np.ndarray, scale: np.float32, out: np.ndarray) -> None:
+def _add_extra(extra: np.ndarray, keys: np.ndarray, first: int, scale: np.float32, out: np.ndarray) -> None:
+    last = first + out.shape[1]
     for t in range(len(extra)):
         row = out[t]
         for e in range(extra.shape[1]):
             a, b, c = extra[t, e, 0], extra[t, e, 1], extra[t, e, 2]
-            ka, kb, kc = keys[e, 0], keys[e, 1], keys[e, 2]
+            ka, kb, kc = keys[e, 0][first:last], keys[e, 1][first:last], keys[e, 2][first:last]
             for u in range(len(row)):
                 row[u] += scale * np.sqrt((a - ka[u]) ** 2 + (b - kb[u]) ** 2 + (c - kc[u]) ** 2)
 

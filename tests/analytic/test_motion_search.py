@@ -35,19 +35,15 @@ def brute_force(query: Keys, database: Keys, patch: int, stride: int) -> np.ndar
 def test_frame_distances_are_geodesic_to_float_precision():
     rng = np.random.default_rng(0)
     a, b = random_keys(rng, [9], extra=0), random_keys(rng, [11], extra=0)
-    got = frame_distances(
-        a.rotations, a.extra, b.rotations.transpose(1, 2, 0).copy(), b.extra.transpose(1, 2, 0).copy()
-    )
-    want = geodesic(
-        from_quaternion(a.rotations.astype(float))[:, None], from_quaternion(b.rotations.astype(float))[None]
-    )
-    np.testing.assert_allclose(got, want.sum(-1), atol=2e-5)
+    got = frame_distances(a.rotations, a.extra, b, 2, 10)
+    left, right = from_quaternion(a.rotations.astype(float)), from_quaternion(b.rotations.astype(float))
+    np.testing.assert_allclose(got, geodesic(left[:, None], right[None, 2:10]).sum(-1), atol=2e-5)
 
 
 def test_angle_of_equal_rotations_is_zero_and_sign_of_quaternion_does_not_matter():
     a = random_keys(np.random.default_rng(1), [6], extra=0)
-    keys = np.ascontiguousarray(-a.rotations.transpose(1, 2, 0))
-    assert np.all(np.diagonal(frame_distances(a.rotations, a.extra, keys, np.zeros((0, 3, 6), np.float32))) == 0)
+    turned = Keys(-a.rotations, a.extra, a.clip_start)
+    assert np.all(np.diagonal(frame_distances(a.rotations, a.extra, turned, 0, 6)) == 0)
 
 
 @pytest.mark.parametrize("blocks", [(256, 2048), (7, 9)])

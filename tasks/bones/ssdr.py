@@ -78,7 +78,7 @@ def ssdr(
     near_first = locality * (coarse / paths.alignment.scale) ** 2 / train.frames
     part = paths.take(chosen)
     bones = _start(part, clusters.labels[chosen], math.ceil(surplus * wanted), influences)
-    history = _alternate(part, bones, _WARM_UP, locality=near_first)
+    history = _alternate(part, bones, _WARM_UP if len(bones.offsets) > wanted else 0, locality=near_first)
     while len(bones.offsets) > wanted:
         _remove(part, bones, wanted)
         history += _alternate(part, bones, _BETWEEN, locality=near_first)

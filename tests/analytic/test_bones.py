@@ -16,7 +16,7 @@ from tasks.geometry.measure import diagonal, vertex_rmse
 from tasks.geometry.skinning import skin
 from tasks.values import Canonical, Motion, same
 
-CLUSTERING = {"max_bones": 12, "count": "auto", "slack": 0.05, "exact": 1e-4, "rounds": 4, "seed": 0}
+CLUSTERING = {"max_bones": 12, "count": "auto", "slack": 0.02, "exact": 1e-4, "rounds": 4, "seed": 0}
 SSDR = {
     "influences": 4,
     "surplus": 1.6,

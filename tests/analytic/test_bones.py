@@ -14,7 +14,7 @@ from tasks.errors import InputError
 from tasks.geometry import rigid, rotations
 from tasks.geometry.measure import diagonal, vertex_rmse
 from tasks.geometry.skinning import skin
-from tasks.values import Canonical, Motion, same
+from tasks.values import Canonical, Clusters, Motion, same
 
 CLUSTERING = {"max_bones": 12, "count": "auto", "slack": 0.02, "exact": 1e-4, "rounds": 4, "seed": 0}
 SSDR = {
@@ -74,7 +74,7 @@ def test_planted_rigid_parts_are_found_and_counted(parts: int, noise: float) -> 
     assert clusters.transforms.shape[1] == parts
     pairs = np.unique(np.stack([labels, clusters.labels]), axis=1)
     assert pairs.shape[1] == parts  # one cluster for one part
-    skinning = rigid_skinning(motion_of(moved), canonical_of(points), clusters)
+    skinning = rigid_skinning(motion_of(moved), canonical_of(points), clusters, spread=0)
     assert skinning.history[-1] < (1.01 * noise + 1e-6) * diagonal(points)
 
 
@@ -184,3 +184,22 @@ def test_settings_out_of_range_are_named(setting: str, value: float) -> None:
     clusters = cluster(motion, canonical_of(points), **CLUSTERING)
     with pytest.raises(InputError, match=setting):
         ssdr(motion, canonical_of(points), clusters, **{**SSDR, setting: value})
+
+
+def test_spread_shares_points_with_their_neighbours() -> None:
+    """Two rods end to end: far from the seam nothing changes, at the seam both bones have a share."""
+    rng = np.random.default_rng(10)
+    points = np.stack([np.linspace(-1, 1, 200), *rng.uniform(-0.01, 0.01, (2, 200))], 1)
+    labels = (points[:, 0] > 0).astype(np.int32)
+    transforms = random_transforms(rng, 4, 2).astype(np.float32)
+    motion = motion_of(rigid.apply(transforms[:, labels], points))
+    clusters = Clusters(labels, transforms, np.array([2]), np.array([0.0]))
+    hard = rigid_skinning(motion, canonical_of(points), clusters, spread=0)
+    soft = rigid_skinning(motion, canonical_of(points), clusters, spread=5)
+    assert hard.history[-1] < 1e-6 < soft.history[-1]
+    np.testing.assert_allclose(soft.weights.sum(1), 1, atol=1e-6)
+    far = np.abs(points[:, 0]) > 0.5
+    np.testing.assert_array_equal(soft.weights[far], hard.weights[far])
+    assert 0.2 < soft.weights[100, 0] < 0.8
+    with pytest.raises(InputError, match="spread"):
+        rigid_skinning(motion, canonical_of(points), clusters, spread=-1)

@@ -12,11 +12,20 @@ from tasks.skeleton.manifold import components_of
 from tasks.skeleton.mend import mend
 
 _COARSE = 4  # fine cells along a coarse one
-# passes of smoothing and cells the border moves out, tried in this order: smoothing closes tunnels that single wrong
-# normals make, moving out joins parts and thickens sheets
-_ATTEMPTS = ((0, 0.0), (1, 0.0), (4, 0.0), (4, 0.5), (8, 0.5), (8, 1.0), (8, 2.0), (8, 4.0))
+# passes of smoothing, cells the border moves out and what that costs, in half handles: smoothing closes tunnels that
+# single wrong normals make, moving out joins parts and thickens sheets but swallows limbs
+_ATTEMPTS = (
+    (0, 0.0, 0.0),
+    (1, 0.0, 1.0),
+    (4, 0.0, 2.0),
+    (4, 0.5, 3.0),
+    (8, 0.5, 4.0),
+    (8, 1.0, 8.0),
+    (8, 2.0, 16.0),
+    (8, 4.0, 32.0),
+)
 _ENOUGH = 0.98  # of the points, in or near the component that is kept
-_PER_HANDLE, _PER_LOSS = 2.0, 1000.0  # in steps down the list of attempts: a handle, and all points lost
+_PER_HANDLE, _PER_LOSS = 2.0, 1000.0  # on the scale of these costs: a handle, and all points lost
 _CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
 _EDGES = [(a, b) for a in range(8) for b in range(a) if np.abs(_CORNERS[a] - _CORNERS[b]).sum() == 1]
 
@@ -33,8 +42,8 @@ def border(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray, cells: i
     corners, cubes, distance = _sample(vertices, faces, points, size)
     smooth = None
     best, best_score, passed = None, np.inf, 0
-    for attempt, (passes, swell) in enumerate(_ATTEMPTS):
-        if attempt >= best_score:
+    for passes, swell, cost in _ATTEMPTS:
+        if cost >= best_score:
             break
         if passes > passed:
             smooth = _averaging(cubes, len(corners)) if smooth is None else smooth
@@ -44,7 +53,7 @@ def border(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray, cells: i
         mesh = _largest(distance - swell * size, corners, cubes)
         if mesh is not None:
             lost = max(0.0, _ENOUGH - _share(*mesh, points, 1.5 * size))
-            score = attempt + _PER_HANDLE * _handles(*mesh) + _PER_LOSS * lost
+            score = cost + _PER_HANDLE * _handles(*mesh) + _PER_LOSS * lost
             if score < best_score:
                 best, best_score = mesh, score
     if best is None:

@@ -33,7 +33,8 @@ def shaking(posed: Posed, bone: int, lags: list[int]) -> np.ndarray:
 
 def fit(x: np.ndarray, y: np.ndarray, clip_start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Ridge regression of y (F, Y) on x (F, D): coefficients (D, Y), and each clip as the others predict it (F, Y).
-    The ridge is the one that predicts left-out clips best; where none beats zero, both are zero."""
+    The ridge is the one that predicts left-out clips best; where none beats zero, or where a lone clip leaves nothing
+    to judge by (pieces of one clip are too alike to be left out in turn), both are zero."""
     clips = [slice(int(a), int(b)) for a, b in pairwise(clip_start)]
     grams, products = [x[c].T @ x[c] for c in clips], [x[c].T @ y[c] for c in clips]
     gram, product, eye = sum(grams), sum(products), np.eye(x.shape[1])

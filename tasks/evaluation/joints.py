@@ -17,6 +17,7 @@ from tasks.values import Rig
 
 NEAR, NEARER = 0.05, 0.025  # a match counts within these shares of the diagonal
 _BONE_SAMPLES = 0.005  # spacing of points along bones, as a share of the diagonal
+_OWNS = 0.5  # a joint moves skin when it outweighs all others together somewhere
 
 
 def counting_joints(rig: Rig, degrees: float) -> tuple[np.ndarray, np.ndarray]:
@@ -26,7 +27,7 @@ def counting_joints(rig: Rig, degrees: float) -> tuple[np.ndarray, np.ndarray]:
     """
     identity = np.eye(3, dtype=rig.rotations.dtype)
     turn = np.degrees(geodesic(rig.rotations, identity).max(axis=0))
-    counts = (turn > degrees) & (rig.weights.max(axis=0) > 0.1)
+    counts = (turn > degrees) & (rig.weights.max(axis=0) > _OWNS)
     keep = np.flatnonzero(counts)
     new = np.full(len(counts), -1)
     new[keep] = np.arange(len(keep))

@@ -13,13 +13,20 @@ _RIDGE = 1e-9
 
 
 def fit_weights(
-    rest: np.ndarray, points: np.ndarray, transforms: np.ndarray, *, influences: int, exchanges: int
+    rest: np.ndarray,
+    points: np.ndarray,
+    transforms: np.ndarray,
+    *,
+    influences: int,
+    exchanges: int,
+    start: np.ndarray | None = None,
 ) -> np.ndarray:
     """min sum_f |sum_b w_b T_fb h_n - x_fn|^2 with w >= 0, sum w = 1 and at most ``influences`` non-zeros
     (Le & Deng 2012, eq. 3-6, solved by exchange over all transforms rather than over a list of candidates).
 
-    rest: (N, 3); points: (F, N, 3); transforms: (F, B, 3, 4) -> (N, B) float32. Sums over frames are taken first, so
-    the solve of a point does not grow with F.
+    rest: (N, 3); points: (F, N, 3); transforms: (F, B, 3, 4); start: (N, B) weights whose support is improved
+    (points without any begin from twice the influences, of which the least useful go) -> (N, B) float32. Sums over
+    frames are taken first, so the solve of a point does not grow with F.
     """
     frames, bones = transforms.shape[:2]
     t = transforms.astype(np.float64).transpose(0, 2, 1, 3).reshape(3 * frames, 4 * bones)
@@ -33,57 +40,102 @@ def fit_weights(
         linear = ((x @ t).reshape(b - a, bones, 4) * h[a:b, None]).sum(2)
         # with sum w = 1 the error is w^T q w; q is the Gram matrix of the single-bone residuals
         q = quadratic - linear[:, :, None] - linear[:, None, :] + (x * x).sum(1)[:, None, None]
-        return _solve_points(q, influences, exchanges)
+        first = np.zeros((b - a, bones)) if start is None else start[a:b].astype(np.float64)
+        return _solve_points(q, first, influences, exchanges)
 
     none = np.zeros((0, bones))
     return np.concatenate([none, *for_chunks(part, len(rest), CHUNK)]).astype(np.float32)
 
 
 @njit(cache=True, nogil=True)
-def _solve_points(q: np.ndarray, influences: int, exchanges: int) -> np.ndarray:
+def _solve_points(q: np.ndarray, start: np.ndarray, influences: int, exchanges: int) -> np.ndarray:
     out = np.zeros(q.shape[:2])
     for n in range(len(q)):
-        _solve_point(q[n], influences, exchanges, out[n])
+        _solve_point(q[n], start[n], influences, exchanges, out[n])
     return out
 
 
 @njit(cache=True, nogil=True)
-def _solve_point(q: np.ndarray, influences: int, exchanges: int, w: np.ndarray) -> None:
-    """Start from the best single bone; add the bone of steepest descent; above the limit drop the least useful."""
-    bones = len(q)
-    support = np.empty(influences + 1, np.int64)
-    values = np.zeros(influences + 1)
-    best = 0
-    for b in range(bones):
-        if q[b, b] < q[best, best]:
-            best = b
-    support[0], values[0], size = best, 1.0, 1
-    error = q[best, best]
-    tried = np.zeros(bones, np.bool_)
-    for _ in range(influences + exchanges):
-        add, slope = -1, error * (1.0 - 1e-6)
-        for b in range(bones):
-            if tried[b]:
-                continue
-            g = 0.0
-            for i in range(size):
-                g += q[b, support[i]] * values[i]
-            if g < slope:
-                add, slope = b, g
+def _solve_point(q: np.ndarray, start: np.ndarray, influences: int, exchanges: int, w: np.ndarray) -> None:
+    """From the start's support, or from a wide one narrowed down, try exchanges: the bone of steepest descent comes
+    in, above the limit the least useful goes out."""
+    room = 2 * influences + 1
+    support, values = np.empty(room, np.int64), np.zeros(room)
+    size = 0
+    while size < influences:
+        best = -1
+        for b in range(len(q)):
+            if start[b] > 0.0 and (best < 0 or start[b] > start[best]) and not _holds(support, size, b):
+                best = b
+        if best < 0:
+            break
+        support[size] = best
+        size += 1
+    if size == 0:
+        best = 0
+        for b in range(len(q)):
+            if q[b, b] < q[best, best]:
+                best = b
+        support[0], values[0], size = best, 1.0, 1
+        size, error = _grow(q, support, values, size, 2 * influences)
+        while size > influences:
+            size, error = _drop_one(q, support, values, size)
+    else:
+        size, error = _descend(q, support, values, size)
+    refused = np.zeros(len(q), np.bool_)
+    for _ in range(exchanges):
+        add = _steepest(q, support, values, size, error, refused)
         if add < 0:
             break
-        tried[add] = True
         new_support, new_values = support.copy(), values.copy()
         new_support[size], new_values[size] = add, 0.0
         new_size, new_error = _descend(q, new_support, new_values, size + 1)
         if new_size > influences:
             new_size, new_error = _drop_one(q, new_support, new_values, new_size)
-        if new_error < error * (1.0 - 1e-9):
+        if new_error < error * (1.0 - 1e-6):
             support, values, size, error = new_support, new_values, new_size, new_error
-            for i in range(size):
-                tried[support[i]] = True
+        else:
+            refused[add] = True
     for i in range(size):
         w[support[i]] = values[i]
+
+
+@njit(cache=True, nogil=True)
+def _holds(support: np.ndarray, size: int, b: int) -> bool:
+    for i in range(size):
+        if support[i] == b:
+            return True
+    return False
+
+
+@njit(cache=True, nogil=True)
+def _steepest(q, support, values, size, error, refused) -> int:
+    """The bone outside the support towards which w^T q w falls fastest, or -1 where none lowers it."""
+    add, slope = -1, error * (1.0 - 1e-6)
+    for b in range(len(q)):
+        if refused[b] or _holds(support, size, b):
+            continue
+        g = 0.0
+        for i in range(size):
+            g += q[b, support[i]] * values[i]
+        if g < slope:
+            add, slope = b, g
+    return add
+
+
+@njit(cache=True, nogil=True)
+def _grow(q: np.ndarray, support: np.ndarray, values: np.ndarray, size: int, limit: int) -> tuple[int, float]:
+    """Adds the bone of steepest descent until ``limit`` are in or none helps."""
+    error = q[support[0], support[0]]
+    refused = np.zeros(len(q), np.bool_)
+    for _ in range(2 * limit):
+        add = _steepest(q, support, values, size, error, refused) if size < limit else -1
+        if add < 0:
+            break
+        refused[add] = True  # a bone that fell out again does not come back
+        support[size], values[size] = add, 0.0
+        size, error = _descend(q, support, values, size + 1)
+    return size, error
 
 
 @njit(cache=True, nogil=True)

@@ -19,7 +19,7 @@ from tasks.skeleton.curve_weights import node_lengths, node_weights
 from tasks.values import Curve, Surface
 
 _SUPPORT = 0.1  # a bone holds the vertices where it weighs more than this
-_EXCHANGES = 1
+_EXCHANGES = 2
 _SWEEPS = 2
 
 
@@ -36,11 +36,13 @@ class Bones:
 
     def keep(self, chosen: np.ndarray) -> Bones:
         """Only the chosen bones, every vertex's weights fitted anew."""
-        return self.with_transforms(self.transforms[:, chosen])
+        return self.with_transforms(self.transforms[:, chosen], self.weights[:, chosen])
 
-    def with_transforms(self, transforms: np.ndarray) -> Bones:
+    def with_transforms(self, transforms: np.ndarray, start: np.ndarray) -> Bones:
         """Other transforms, every vertex's weights fitted to them."""
-        weights = fit_weights(self.rest, self.paths, transforms, influences=self.influences, exchanges=_EXCHANGES)
+        weights = fit_weights(
+            self.rest, self.paths, transforms, influences=self.influences, exchanges=_EXCHANGES, start=start
+        )
         return Bones(self.rest, self.paths, weights, transforms, self.influences)
 
     def improve(self, rounds: int) -> Bones:
@@ -48,7 +50,7 @@ class Bones:
         bones = self
         for _ in range(rounds):
             moments = skin_moments(bones.rest, bones.weights, bones.paths)
-            bones = bones.with_transforms(fit_rigid(moments, bones.transforms, _SWEEPS))
+            bones = bones.with_transforms(fit_rigid(moments, bones.transforms, _SWEEPS), bones.weights)
         return bones
 
 

@@ -67,20 +67,21 @@ def test_bones_are_sampled_to_the_spacing():
 
 
 def test_joints_that_do_not_turn_or_move_no_skin_do_not_count():
-    turn = np.zeros((2, 4, 3))
-    turn[1, :, 2] = np.radians([0.0, 20.0, 2.0, 20.0])
-    weights = np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]])
+    turn = np.zeros((2, 5, 3))
+    turn[1, :, 2] = np.radians([0.0, 20.0, 2.0, 20.0, 30.0])
+    weights = np.eye(5)
+    weights[3] = [1, 0, 0, 0, 0]
     rig = Rig(
-        ("a", "b", "c", "d"),
-        np.array([-1, 0, 1, 2], np.int32),
-        np.arange(12.0).reshape(4, 3),
+        ("still", "turns", "turns too little", "moves no skin", "turns as well"),
+        np.array([-1, 0, 1, 2, 3], np.int32),
+        np.arange(15.0).reshape(5, 3),
         weights,
         from_rotation_vector(turn),
-        np.zeros((2, 4, 3)),
+        np.zeros((2, 5, 3)),
     )
     joints, parents = counting_joints(rig, 5.0)
-    assert joints.tolist() == [[3.0, 4.0, 5.0]]
-    assert parents.tolist() == [-1]
+    assert joints.tolist() == [[3.0, 4.0, 5.0], [12.0, 13.0, 14.0]]
+    assert parents.tolist() == [-1, 0]
 
 
 def test_an_empty_skeleton_is_refused():

@@ -13,7 +13,7 @@ from tasks.values import Motion, Poses
 
 @dataclass(frozen=True)
 class Quality:
-    """Of one clip. depth: (F, N) metres inside the body, negative outside; strain: (F, E) change of edge lengths over
+    """Of one clip. depth: (some F, N) metres inside the body, negative outside; strain: (F, E) change of edges over
     those at rest; speed: (F - 1, N) metres a second."""
 
     depth: np.ndarray
@@ -33,11 +33,17 @@ class Quality:
         }
 
 
-def quality(body: Motion, poses: Poses, points: np.ndarray, rest: np.ndarray, faces: np.ndarray, fps: float) -> Quality:
-    """points: (F, N, 3) the cloth at the poses' frames; rest: (N, 3) its stress-free shape."""
+def quality(
+    body: Motion, poses: Poses, points: np.ndarray, rest: np.ndarray, faces: np.ndarray, *, fps: float, every: int
+) -> Quality:
+    """points: (F, N, 3) the cloth at the poses' frames; rest: (N, 3) its stress-free shape; every: depth, which takes a
+    tenth of a second a frame, is measured at each `every`-th frame only."""
+    some = slice(None, None, every)
+    at = Poses(poses.rotations[some], poses.translations[some], poses.clip_start)
     hard = collision_faces(body)
+    depth = [depth_in(skin, hard, cloth) for skin, cloth in zip(body_points(body, at), points[some], strict=True)]
     return Quality(
-        depth=np.stack([depth_in(skin, hard, p) for skin, p in zip(body_points(body, poses), points, strict=True)]),
+        depth=np.stack(depth),
         strain=strain(points, rest, faces),
         speed=np.linalg.norm(np.diff(points, axis=0), axis=2) * fps,
     )

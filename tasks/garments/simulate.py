@@ -104,7 +104,7 @@ def simulate_chunk(
     body: Motion,
     garment: Canonical,
     poses: Poses,
-    cloth: Cloth,
+    cloth: Cloth | None,
     *,
     first: int,
     count: int,
@@ -122,7 +122,7 @@ def simulate_chunk(
 ) -> tuple[Motion, Cloth]:
     """`count` frames from `first` on as a motion of the cloth, and the state after the last, for a cached stage.
 
-    cloth: the state at frame first - 1; the other settings as in :func:`simulate`.
+    cloth: the state at frame first - 1, or None: the garment as cut; settings as in :func:`simulate`.
     """
     settings = {"density": density, "stretch": stretch, "bend": bend, "damping": damping, "contact": contact}
     settings |= {"friction": friction, "thickness": thickness, "drag": drag}

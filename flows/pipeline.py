@@ -12,6 +12,8 @@ from flows import schema
 from flows.config import NO_ABLATION, Case
 from flows.graph import Graph, Node
 
+PANELS = 4  # methods or variants side by side in the picture of errors
+
 Output = tuple[Node, str]  # a node and one of its outputs
 
 
@@ -103,12 +105,13 @@ def _skeleton(settings: dict, add, train, test, canonical, skinning) -> dict[str
 
 
 def plan_pictures(planned: list[Planned], graph: Graph) -> list[Node]:
-    """The figures of a report: for every dataset, its last case and the errors of up to four methods or variants."""
+    """The figures of a report: for every dataset, its last case, and the errors of some methods or variants."""
     found: list[Node] = []
     for data in dict.fromkeys(p.case.data for p in planned):
         cases = [p for p in planned if p.case.data == data]
         first = [p for p in cases if p.case.variant == cases[0].case.variant]
-        shown = (first if len(first) > 1 else cases)[:4]
+        shown = first if len(first) > 1 else cases
+        shown = shown if len(shown) <= PANELS else [shown[0], *shown[1 - PANELS :]]
         found += _pictures(shown, graph)
     return found
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 from scipy.spatial import cKDTree
 
 from tasks.errors import InputError
 from tasks.geometry.measure import diagonal
-from tasks.skeleton import orient, remesh, solid
+from tasks.skeleton import orient, solid
 from tasks.skeleton.manifold import components_of, is_closed
 from tasks.skeleton.mend import mend
+from tasks.skeleton.remesh import by_edges, isotropic
 from tasks.values import Canonical, Surface
 
 _KEPT = 0.98  # of triangles and points must be left on a mended mesh for it to stand in for the shape
@@ -17,14 +20,16 @@ _NEAR = 0.01  # of the bounding-box diagonal
 _FLAT = 1e-4  # least over largest singular value of points that span a volume
 
 
-def closed_surface(canonical: Canonical, *, vertices: int, cells: int, neighbours: int) -> Surface:
+def closed_surface(
+    canonical: Canonical, *, vertices: int, cells: int, neighbours: int, remesh: Literal["edges", "isotropic"]
+) -> Surface:
     """One closed component round the canonical shape, with about `vertices` vertices.
 
     A closed mesh of one component between half and twice that size is used as it is; another size is refined or
-    decimated. Holes are capped and a few bad triangles dropped. What is still not one closed component (separate
-    parts, soups, bare points) is rebuilt: the border of the solid that the generalised winding number tells from its
-    surroundings (Jacobson et al. 2013; Barill et al. 2018), on a grid of `cells` along the longest side. Bare points
-    get their normals from `neighbours` nearest points.
+    decimated edge by edge, or remeshed isotropically. Holes are capped and a few bad triangles dropped. What is still
+    not one closed component (separate parts, soups, bare points) is rebuilt: the border of the solid that the
+    generalised winding number tells from its surroundings (Jacobson et al. 2013; Barill et al. 2018), on a grid of
+    `cells` along the longest side. Bare points get their normals from `neighbours` nearest points.
 
     Raises InputError when the points enclose no volume or a setting is out of range.
     """
@@ -32,7 +37,8 @@ def closed_surface(canonical: Canonical, *, vertices: int, cells: int, neighbour
     points = canonical.points.astype(np.float64)
     position, faces = _one_component(points, canonical.faces, cells, neighbours)
     if not vertices / 2 <= len(position) <= vertices * 2:
-        position, faces = remesh.to_count(position, faces, vertices)
+        to_count = isotropic if remesh == "isotropic" else by_edges
+        position, faces = to_count(position, faces, vertices)
     if _volume(position, faces) < 0:
         faces = faces[:, ::-1]
     if not is_closed(faces, len(position)):

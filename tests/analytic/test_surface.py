@@ -14,7 +14,7 @@ from tasks.skeleton.surface import closed_surface
 from tasks.values import Canonical, Surface, same
 from tests.analytic import shapes
 
-SETTINGS = {"vertices": 1500, "cells": 48, "neighbours": 20}
+SETTINGS = {"vertices": 1500, "cells": 48, "neighbours": 20, "remesh": "edges"}
 ROD = [([0.0, -0.5, 0.0], [0.0, 0.5, 0.0])]
 
 
@@ -58,6 +58,16 @@ def test_fine_mesh_is_thinned_out():
     made = close(*shapes.capsules(ROD, 0.2, 0.02))
     assert 750 <= len(made.vertices) <= 3000
     assert shapes.volume(made.vertices, made.faces) == pytest.approx(np.pi * 0.04 * (1 + 0.8 / 3), rel=0.03)
+
+
+def test_isotropic_remeshing_gives_even_triangles():
+    vertices, faces = shapes.capsules(ROD, 0.2, 0.02)
+    made = close(vertices, faces, remesh="isotropic")
+    assert 750 <= len(made.vertices) <= 3000
+    assert shapes.volume(made.vertices, made.faces) == pytest.approx(shapes.volume(vertices, faces), rel=0.03)
+    sides = [made.vertices[made.faces[:, k]] - made.vertices[made.faces[:, k - 1]] for k in range(3)]
+    lengths = np.linalg.norm(sides, axis=-1)
+    assert np.median(lengths.max(0) / lengths.min(0)) < 1.4
 
 
 def test_open_box_is_closed():

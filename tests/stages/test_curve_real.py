@@ -10,9 +10,10 @@ from tasks.skeleton.curve import curve_skeleton
 from tasks.skeleton.manifold import components_of, is_closed
 from tasks.skeleton.surface import closed_surface
 from tasks.values import Canonical, Curve, Surface
+from tests.shipped import shipped
 
-SURFACE = {"vertices": 6000, "cells": 128, "neighbours": 20}
-CURVE = {"speed": 0.1, "medial": 0.1, "edge": 0.002, "angle": 110.0, "stop": 1e-4, "rounds": 500, "twig": 1.0}
+SURFACE = shipped("skeleton.surface")
+CURVE = shipped("skeleton.curve")
 
 
 def sound(points: np.ndarray, faces: np.ndarray | None) -> tuple[Surface, Curve]:

@@ -28,7 +28,8 @@ class Planned:
 
 
 def plan(case: Case, graph: Graph) -> Planned:
-    """Adds a case's stages to the graph; ``pipeline: rig`` ends with the skeleton, ``animate`` with unseen poses."""
+    """Adds a case's stages to the graph; ``pipeline: rig`` ends with the skeleton, ``animate`` with unseen poses,
+    a benchmark measures a stage against a peer."""
     config = case.config
     name = f"{case.data} {case.method}" + (f" {case.variant}" if case.variant != NO_ABLATION else "")
 
@@ -37,6 +38,8 @@ def plan(case: Case, graph: Graph) -> Planned:
         path = settings.get("path") if stage == "dataset" else None
         return graph.add(stage, function, settings, outputs=tuple(outputs.split()), case=name, path=path, **inputs)
 
+    if config["pipeline"] in schema.BENCHMARKS:
+        return _benchmark(case, name, add)
     nodes = _rig(config, add)
     shared = {n: nodes[n] for n in ("train", "canonical", "skinning", "skeleton", "poses")}
     metrics = [add("evaluate", schema.EVALUATE_RIG, config["evaluate"], "metrics", **shared)]
@@ -47,15 +50,39 @@ def plan(case: Case, graph: Graph) -> Planned:
     return Planned(case, name, tuple(metrics), nodes)
 
 
-def _rig(config: dict, add) -> dict[str, Output]:
-    """Stages 1 to 3: data, bones, skeleton, parts."""
+def _benchmark(case: Case, name: str, add) -> Planned:
+    """A stage of ours and a peer, timed in one stage of its own on the same data."""
+    config, function = case.config, schema.BENCHMARKS[case.config["pipeline"]]
+    nodes = _data(config, add)
+    if config["pipeline"] == "benchmark_bones":
+        stages = {"clustering": schema.CLUSTER, "decomposition": schema.SSDR}
+        own = {n: schema.arguments(f, config["bones"], config["seed"]) for n, f in stages.items()}
+        inputs = {n: nodes[n] for n in ("motion", "train", "test", "canonical")}
+    else:
+        own = {"tracing": schema.arguments(schema.CURVE, config["skeleton"]["curve"], config["seed"])}
+        surface = config["skeleton"]["surface"]
+        inputs = {
+            "surface": add("surface", schema.SURFACE, surface, "surface", canonical=nodes["canonical"])["surface"]
+        }
+    measured = add("benchmark", function, config["benchmark"] | own, "metrics", **inputs)
+    return Planned(case, name, (measured,), nodes)
+
+
+def _data(config: dict, add) -> dict[str, Output]:
+    """Stage 1: the motion, its seen and unseen part, the canonical shape."""
     data = config["dataset"]
     motion = add("dataset", schema.load_function(data["kind"]), data, "motion")["motion"]
     halves = add("split", schema.SPLIT, config["split"], "train test", motion=motion)
     train, test = halves["train"], halves["test"]
     choice = {"choice": config["skeleton"]["canonical"]}
     canonical = add("canonical", schema.CANONICAL, choice, "canonical", train=train)["canonical"]
+    return {"motion": motion, "train": train, "test": test, "canonical": canonical}
 
+
+def _rig(config: dict, add) -> dict[str, Output]:
+    """Stages 1 to 3: data, bones, skeleton, parts."""
+    data = _data(config, add)
+    train, test, canonical = data["train"], data["test"], data["canonical"]
     bones = config["bones"]
     clusters = add("clusters", schema.CLUSTER, bones, "clusters", train=train, canonical=canonical)["clusters"]
     decompose = schema.SSDR if bones["kind"] == "ssdr" else schema.RIGID
@@ -65,7 +92,7 @@ def _rig(config: dict, add) -> dict[str, Output]:
     found = _skeleton(config["skeleton"], add, train, test, canonical, skinning)
     inputs = {"skeleton": found["skeleton"], "skinning": skinning}
     parts = add("parts", schema.PARTS, config["parts"], "parts", **inputs)["parts"]
-    nodes = {"train": train, "test": test, "canonical": canonical, "clusters": clusters, "skinning": skinning}
+    nodes = data | {"clusters": clusters, "skinning": skinning}
     return nodes | found | {"parts": parts}
 
 
@@ -107,6 +134,7 @@ def _skeleton(settings: dict, add, train, test, canonical, skinning) -> dict[str
 def plan_pictures(planned: list[Planned], graph: Graph) -> list[Node]:
     """The figures of a report: for every dataset, its last case, and the errors of some methods or variants."""
     found: list[Node] = []
+    planned = [p for p in planned if "skinning" in p.nodes]  # benchmarks make none
     for data in dict.fromkeys(p.case.data for p in planned):
         cases = [p for p in planned if p.case.data == data]
         first = [p for p in cases if p.case.variant == cases[0].case.variant]

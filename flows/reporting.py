@@ -17,6 +17,19 @@ from flows.store import Ref, Store
 UNSEEN = ("rmse_pct", "rmse", "rmse_coordinate")
 MOTION = ("velocity_rmse", "speed_ratio", "max_error")
 RIG = ("bones_rmse_pct", "bones_count", "skeleton_rmse_pct", "joints_count")
+# of each benchmark: what decides, and the numbers behind it
+BENCHMARKS = {
+    "benchmark_bones": (
+        ("time_ratio", "rmse_ratio", "time_to_peer_rmse_ratio", "held_out_rmse_ratio"),
+        ("seconds", "peer_seconds", "bones_rmse_pct", "peer_rmse_pct"),
+        ("cpu_ratio", "memory", "peer_memory", "bones_count", "peer_bones_count"),
+    ),
+    "benchmark_skeleton": (
+        ("time_ratio", "seconds", "peer_seconds", "cpu_ratio", "memory", "peer_memory"),
+        ("curve_leaves", "peer_curve_leaves", "curve_junctions", "peer_curve_junctions", "curve_cycles"),
+        ("curve_inside_pct", "peer_curve_inside_pct", "curve_mapped_pct", "peer_curve_mapped_pct"),
+    ),
+}
 TRUTH = ("joint_f1", "joint_f1_fine", "link_f1", "j2j_pct", "j2b_pct", "b2b_pct")
 
 
@@ -79,6 +92,11 @@ def _tables(planned: list[Planned], rows, settings: dict) -> list:
         "baselines": settings["baselines"],
     }
     tables = []
+    pipelines = dict.fromkeys(p.case.config["pipeline"] for p in planned)
+    for name in (n for n in pipelines if n in BENCHMARKS):
+        tables += _benchmark_tables([p for p in planned if p.case.config["pipeline"] == name], rows, settings, common)
+    if len(tables) and set(pipelines) <= set(BENCHMARKS):
+        return tables
     if rows["metric"].isin(UNSEEN).any():
         printed = {"paper": paper, "paper_table": settings["paper_table"]} if settings["paper_table"] else {}
         notes = _notes(planned, settings)
@@ -89,6 +107,23 @@ def _tables(planned: list[Planned], rows, settings: dict) -> list:
     if rows["metric"].isin(TRUTH).any():
         tables.append(build(lead, title="Joints against the true rig", metrics=TRUTH, notes=[], **common))
     return tables
+
+
+def _benchmark_tables(planned: list[Planned], rows, settings: dict, common: dict) -> list:
+    """What was measured against a peer: the ratios first, then the numbers behind them."""
+    from tasks.evaluation.tables import build
+
+    first, *others = BENCHMARKS[planned[0].case.config["pipeline"]]
+    chosen = rows[rows["method"].isin({p.case.method for p in planned})]
+    node = planned[0].case.config["benchmark"]
+    notes = [
+        "Ratios are ours / the peer's, timed in turn in one process with nothing beside it; below 1 ours is better.",
+        f"Medians of {node['repeats']} runs of ours and {node.get('peer_repeats', node['repeats'])} of the peer, timed "
+        "when the stage was computed: a run that takes it from the store shows the same times.",
+        *([settings["note"]] if settings["note"] else []),
+    ]
+    made = [build(chosen, title=settings["title"], metrics=first, notes=notes, **common)]
+    return made + [build(chosen, title="Behind the ratios", metrics=metrics, notes=[], **common) for metrics in others]
 
 
 def _curve(planned: list[Planned], rows, curve: list[str] | None) -> list:

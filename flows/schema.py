@@ -32,6 +32,10 @@ DATABASE = "tasks.motion.database:build_database"
 PARTS = "tasks.motion.parts:find_parts"
 EVALUATE = "tasks.evaluation.metrics:evaluate"
 EVALUATE_RIG = "tasks.evaluation.rig:evaluate_rig"
+BENCHMARKS = {
+    "benchmark_bones": "tasks.benchmarks.bones:benchmark_bones",
+    "benchmark_skeleton": "tasks.benchmarks.skeleton:benchmark_skeleton",
+}
 
 REPORT = {
     "name": str,
@@ -44,6 +48,7 @@ REPORT = {
     "note": str,
 }
 FROM_RUN = {"seed"}  # arguments that come from the top of the config
+OF_STAGES = {"clustering", "decomposition", "tracing"}  # a benchmark's arguments that are whole stages' settings
 RENAMED = {"lambda_": "lambda"}  # Python keywords that are the field's names in the config
 
 
@@ -59,8 +64,11 @@ def animate_function(function: str) -> str:
 
 def schema(config: dict) -> dict[str, object]:
     """The type of every key that this config may have, nested as the config is."""
-    dataset, animate = config["dataset"], config["animate"]
+    dataset = config["dataset"]
+    pipeline = config["pipeline"]
     skeleton: dict[str, object] = {"kind": Literal["curve", "given"]}
+    if pipeline == "benchmark_skeleton":
+        skeleton["kind"] = Literal["curve"]
     if config["skeleton"].get("kind") != "given":
         skeleton |= {
             "joints": Literal["motion", "gradient"],
@@ -70,10 +78,12 @@ def schema(config: dict) -> dict[str, object]:
             **{name: settings(function) for name, function in JOINTS.items()},
         }
     bones = {"kind": Literal["ssdr", "clusters"], **settings(CLUSTER)}
+    if pipeline == "benchmark_bones":
+        bones["kind"] = Literal["ssdr"]
     bones |= settings(SSDR if config["bones"].get("kind") != "clusters" else RIGID)
     return {
         "seed": int,
-        "pipeline": Literal["animate", "rig"],
+        "pipeline": Literal["animate", "rig", "benchmark_bones", "benchmark_skeleton"],
         "dataset": {
             "kind": str,
             "status": Literal["paper", "substitute"],
@@ -83,19 +93,24 @@ def schema(config: dict) -> dict[str, object]:
         "split": settings(SPLIT),
         "bones": bones,
         "skeleton": skeleton | settings(CANONICAL, rename={"choice": "canonical"}),
-        "animate": {
-            "name": str,
-            "label": str,
-            "function": str,
-            **settings(animate_function(animate.get("function", ""))),
-        },
-        "parts": settings(PARTS),
+        **_method(config),
         "evaluate": settings(EVALUATE) | settings(EVALUATE_RIG),
         "report": REPORT,
         "store": {"path": str},
         "runner": {"kind": Literal["threads", "processes"], "workers": int},
         "sweep": {"datasets": list[str] | None, "methods": list[str] | None, "ablations": list[str] | None},
     }
+
+
+def _method(config: dict) -> dict[str, object]:
+    """What a file of the group ``method`` sets: a method of ours, or a peer to be measured against."""
+    labels = {"name": str, "label": str}
+    benchmark = BENCHMARKS.get(str(config["pipeline"]))
+    if benchmark:
+        own = {n: t for n, t in settings(benchmark).items() if n not in OF_STAGES}
+        return {"animate": labels, "benchmark": own}
+    function = animate_function(config["animate"].get("function", ""))
+    return {"animate": labels | {"function": str, **settings(function)}, "parts": settings(PARTS)}
 
 
 def settings(function: str, *, rename: dict[str, str] | None = None) -> dict[str, object]:

@@ -11,7 +11,16 @@ from typing import Literal
 from tasks.errors import InputError
 
 ROOT = Path(__file__).resolve().parent.parent
-_TYPES = {"int": int, "float": float, "str": str, "bool": bool, "None": None, "list": list, "Literal": Literal}
+_TYPES = {
+    "int": int,
+    "float": float,
+    "str": str,
+    "bool": bool,
+    "None": None,
+    "list": list,
+    "dict": dict,
+    "Literal": Literal,
+}
 
 
 @cache

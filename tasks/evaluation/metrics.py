@@ -25,7 +25,7 @@ class Metric:
     text: one line for readers; digits: decimals in tables, or None for three significant ones."""
 
     label: str
-    kind: Literal["length", "speed", "percent", "ratio", "count", "decibel", "hours"]
+    kind: Literal["length", "speed", "percent", "ratio", "count", "decibel", "hours", "seconds", "memory"]
     better: Literal["lower", "higher", "one", "none"]
     text: str
     digits: int | None = None
@@ -56,9 +56,42 @@ METRICS: dict[str, Metric] = {
     "ssim": Metric("SSIM", "ratio", "higher", "structural similarity of rendered images", 3),
     "lpips": Metric("LPIPS", "ratio", "lower", "learned perceptual distance of rendered images", 4),
     "optimise_hours": Metric("optimisation", "hours", "lower", "time to optimise one scene", 2),
+    "time_ratio": Metric("time", "ratio", "lower", "benchmarks: seconds on the wall, ours / the peer's", 4),
+    "cpu_ratio": Metric("processor time", "ratio", "lower", "the same for the processor time of all threads", 4),
+    "rmse_ratio": Metric("RMSE ratio", "ratio", "lower", "vertex RMSE, ours / the peer's", 3),
+    "time_to_peer_rmse_ratio": Metric(
+        "time to peer's RMSE", "ratio", "lower", "seconds of our quickest settings that reach the peer's RMSE / its", 4
+    ),
+    "held_out_rmse_ratio": Metric("held-out RMSE", "ratio", "lower", "on unseen frames, weights frozen, ours / its", 3),
+    "seconds": Metric("time", "seconds", "lower", "seconds on the wall, median"),
+    "peer_seconds": Metric("peer's time", "seconds", "none", "the same of the peer"),
+    "cpu_seconds": Metric("processor time", "seconds", "lower", "processor time of all threads, median"),
+    "peer_cpu_seconds": Metric("peer's processor time", "seconds", "none", "the same of the peer"),
+    "memory": Metric("memory", "memory", "lower", "memory at the peak on top of what was in use before", 0),
+    "peer_memory": Metric("peer's memory", "memory", "none", "the same of the peer", 0),
+    "peer_rmse_pct": Metric("peer's RMSE", "percent", "none", "the peer's bones on the frames they were fitted to", 3),
+    "peer_bones_count": Metric("peer's bones", "count", "none", "number of bones that the peer found", 0),
+    "curve_leaves": Metric("leaves", "count", "none", "ends of the curve skeleton", 0),
+    "curve_junctions": Metric("junctions", "count", "none", "nodes where three or more branches meet", 0),
+    "curve_cycles": Metric("cycles", "count", "lower", "loops of the curve skeleton", 0),
+    "curve_inside_pct": Metric("inside", "percent", "higher", "share of the curve's nodes inside the body", 1),
+    "curve_mapped_pct": Metric("mapped once", "percent", "higher", "surface vertices that belong to one node", 1),
+    "peer_curve_leaves": Metric("peer's leaves", "count", "none", "ends of the peer's curve skeleton", 0),
+    "peer_curve_junctions": Metric("peer's junctions", "count", "none", "its nodes of three or more branches", 0),
+    "peer_curve_cycles": Metric("peer's cycles", "count", "none", "its loops", 0),
+    "peer_curve_inside_pct": Metric("peer's inside", "percent", "none", "share of its nodes inside the body", 1),
+    "peer_curve_mapped_pct": Metric("peer's mapped once", "percent", "none", "vertices that belong to one node", 1),
 }
 
-_FIXED_UNITS = {"percent": "%", "ratio": "ratio", "count": "count", "decibel": "dB", "hours": "h"}
+_FIXED_UNITS = {
+    "percent": "%",
+    "ratio": "ratio",
+    "count": "count",
+    "decibel": "dB",
+    "hours": "h",
+    "seconds": "s",
+    "memory": "MB",
+}
 
 
 def metric_of(name: str) -> Metric:

@@ -1,0 +1,104 @@
+"""Our bones against Dem Bones, side by side in one process: time, error, error on held-out frames, memory.
+
+A judge that stands above the stages: unlike a stage it may import several of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from tasks.benchmarks import dem_bones
+from tasks.benchmarks.cost import in_turn, measure, median, numbers, threads_held
+from tasks.bones.clustering import cluster
+from tasks.bones.refit import refit_bones
+from tasks.bones.ssdr import ssdr
+from tasks.errors import InputError
+from tasks.evaluation.metrics import declared
+from tasks.geometry.measure import diagonal, vertex_rmse
+from tasks.geometry.skinning import skin
+from tasks.values import Canonical, Metrics, Motion, Skinning
+
+# From quick to thorough: changes to the settings of the decomposition that trade error for time. The first that
+# reaches the peer's error is what ``time_to_peer_rmse_ratio`` times; the settings as shipped come last.
+EFFORTS = (
+    *({"surplus": 1.0, "iterations": rounds} for rounds in (0, 1, 2, 3, 5, 8, 12)),
+    *({"iterations": rounds} for rounds in (2, 8)),
+    {},
+)
+
+
+def benchmark_bones(
+    motion: Motion,
+    train: Motion,
+    test: Motion,
+    canonical: Canonical,
+    *,
+    clustering: dict,
+    decomposition: dict,
+    smooth: float | None,
+    affine: float | None,
+    repeats: int,
+    peer_repeats: int,
+    threads: int,
+) -> Metrics:
+    """Our clusters and decomposition and the peer, in turn, on all frames of a motion; ratios are ours / the peer's.
+
+    clustering, decomposition: the settings of :func:`cluster` and :func:`ssdr`; the peer gets as many bones and
+    influences; smooth, affine: its weightsSmooth and transAffine, None as it comes; repeats, peer_repeats: runs whose
+    median is taken, after one of ours that compiles; threads: 0 for all cores.
+    Held out are the frames of ``test``: bones are made from ``train`` alone, weights frozen, transforms of both fitted
+    to the unseen frames by the same solver. Raises InputError where the extra is missing or a setting out of range.
+    """
+    for name, found in (("repeats", repeats), ("peer_repeats", peer_repeats)):
+        if found < 1:
+            raise InputError(f"benchmark.{name}", expected="at least 1", found=str(found))
+    peer = {"influences": decomposition["influences"], "smooth": smooth, "affine": affine}
+    dem_bones.prepare(motion, canonical, bones=1, **peer)  # says now what it would miss later
+
+    def ours(data: Motion, effort: dict) -> Callable[[], Skinning]:
+        settings = decomposition | effort
+        return lambda: ssdr(data, canonical, cluster(data, canonical, **clustering), **settings)
+
+    with threads_held(threads):
+        peer["bones"] = ours(motion, {})().weights.shape[1]
+        (mine, cost), (solved, peer_cost) = in_turn(
+            lambda: ours(motion, {}), lambda: dem_bones.prepare(motion, canonical, **peer), (repeats, peer_repeats)
+        )
+        theirs = dem_bones.skinning(solved, canonical)
+        quick = _time_to_rmse(lambda effort: ours(motion, effort), motion, _rmse(theirs, motion), repeats)
+        unseen = [ours(train, {})(), dem_bones.skinning(dem_bones.prepare(train, canonical, **peer)(), canonical)]
+    found = numbers(cost, peer_cost) | _errors(mine, theirs, motion, diagonal(canonical.points))
+    if quick is not None:
+        found["time_to_peer_rmse_ratio"] = quick / peer_cost.seconds
+    ours_unseen, peer_unseen = (_held_out(s, test) for s in unseen)
+    return declared(found | {"held_out_rmse_ratio": ours_unseen / peer_unseen}, motion.unit)
+
+
+def _time_to_rmse(
+    ours: Callable[[dict], Callable[[], Skinning]], motion: Motion, target: float, repeats: int
+) -> float | None:
+    """Seconds of the first of ``EFFORTS`` with an error of at most `target`, or None where all miss it."""
+    for effort in EFFORTS:
+        skinning, cost = measure(ours(effort))
+        if _rmse(skinning, motion) <= target:
+            return median([cost, *(measure(ours(effort))[1] for _ in range(repeats - 1))]).seconds
+    return None
+
+
+def _errors(mine: Skinning, theirs: Skinning, motion: Motion, extent: float) -> dict[str, float]:
+    rmse, peer_rmse = _rmse(mine, motion), _rmse(theirs, motion)
+    return {
+        "rmse_ratio": rmse / peer_rmse,
+        "bones_rmse_pct": 100.0 * rmse / extent,
+        "peer_rmse_pct": 100.0 * peer_rmse / extent,
+        "bones_count": float(mine.weights.shape[1]),
+        "peer_bones_count": float(theirs.weights.shape[1]),
+    }
+
+
+def _rmse(skinning: Skinning, motion: Motion) -> float:
+    return vertex_rmse(skin(skinning.rest, skinning.weights, skinning.transforms), motion.points)
+
+
+def _held_out(skinning: Skinning, test: Motion) -> float:
+    return vertex_rmse(skin(skinning.rest, skinning.weights, refit_bones(test, skinning)), test.points)

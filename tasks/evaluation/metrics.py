@@ -56,13 +56,19 @@ METRICS: dict[str, Metric] = {
     "ssim": Metric("SSIM", "ratio", "higher", "structural similarity of rendered images", 3),
     "lpips": Metric("LPIPS", "ratio", "lower", "learned perceptual distance of rendered images", 4),
     "optimise_hours": Metric("optimisation", "hours", "lower", "time to optimise one scene", 2),
-    "time_ratio": Metric("time", "ratio", "lower", "benchmarks: seconds on the wall, ours / the peer's", 4),
-    "cpu_ratio": Metric("processor time", "ratio", "lower", "the same for the processor time of all threads", 4),
+    "time_ratio": Metric("time ratio", "ratio", "lower", "benchmarks: seconds on the wall, ours / the peer's", 4),
+    "cpu_ratio": Metric("processor time ratio", "ratio", "lower", "the same for the processor time of all threads", 4),
     "rmse_ratio": Metric("RMSE ratio", "ratio", "lower", "vertex RMSE, ours / the peer's", 3),
     "time_to_peer_rmse_ratio": Metric(
-        "time to peer's RMSE", "ratio", "lower", "seconds of our quickest settings that reach the peer's RMSE / its", 4
+        "time ratio at peer's RMSE",
+        "ratio",
+        "lower",
+        "seconds of our quickest settings that reach the peer's RMSE / its",
+        4,
     ),
-    "held_out_rmse_ratio": Metric("held-out RMSE", "ratio", "lower", "on unseen frames, weights frozen, ours / its", 3),
+    "held_out_rmse_ratio": Metric(
+        "held-out RMSE ratio", "ratio", "lower", "on unseen frames, weights frozen, ours / its", 3
+    ),
     "seconds": Metric("time", "seconds", "lower", "seconds on the wall, median"),
     "peer_seconds": Metric("peer's time", "seconds", "none", "the same of the peer"),
     "cpu_seconds": Metric("processor time", "seconds", "lower", "processor time of all threads, median"),

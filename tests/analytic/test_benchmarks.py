@@ -1,0 +1,176 @@
+"""Benchmarks: what is timed, how results are read, and numbers that are known beforehand."""
+
+from __future__ import annotations
+
+import os
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tasks.benchmarks import cgal, cost, dem_bones
+from tasks.benchmarks.bones import benchmark_bones
+from tasks.benchmarks.skeleton import benchmark_skeleton, counts
+from tasks.bones.clustering import cluster
+from tasks.bones.ssdr import ssdr
+from tasks.errors import InputError
+from tasks.geometry.measure import vertex_rmse
+from tasks.geometry.rotations import from_rotation_vector
+from tasks.geometry.skinning import skin
+from tasks.values import Canonical, Metrics, Motion
+from tests.analytic import shapes
+from tests.analytic.test_bones import CLUSTERING, SSDR
+from tests.analytic.test_curve_skeleton import ROD, SETTINGS, WYE
+
+OURS = {"clustering": CLUSTERING | {"max_bones": 4, "count": "fixed"}, "decomposition": SSDR}
+PEER = {"smooth": 0.0, "affine": 0.0}
+RUNS = {"repeats": 3, "peer_repeats": 1, "threads": 1}
+
+
+def bending_rod(frames: int = 12) -> tuple[Motion, Canonical]:
+    """A rod that bends along its whole length, and swings."""
+    vertices, faces = shapes.capsules(ROD, 0.2, 0.08)
+    bend = np.sin(np.linspace(0.0, 2 * np.pi, frames, endpoint=False))[:, None]
+    turns = np.stack([0.3 * bend * vertices[:, 1], np.zeros_like(bend * vertices[:, 1]), bend * vertices[:, 1]], -1)
+    points = np.einsum("fnij,nj->fni", from_rotation_vector(turns), vertices).astype(np.float32)
+    motion = Motion("rod", points, faces.astype(np.int32), np.array([0, frames]), ("all",), 24.0)
+    return motion, Canonical(points[0], motion.faces, 0, "first")
+
+
+def named(metrics: Metrics) -> dict[str, float]:
+    return dict(zip(metrics.names, metrics.values.tolist(), strict=True))
+
+
+def measured(**peer: float | None) -> dict[str, float]:
+    motion, canonical = bending_rod()
+    train, test = motion.take_frames([slice(0, 9)], ["seen"]), motion.take_frames([slice(9, 12)], ["unseen"])
+    return named(benchmark_bones(motion, train, test, canonical, **OURS, **peer, **RUNS))
+
+
+def test_a_peer_that_does_the_same_has_ratios_of_one(monkeypatch):
+    def twin(motion, canonical, *, bones, influences, smooth, affine):
+        clusters = cluster(motion, canonical, **OURS["clustering"] | {"max_bones": bones})
+        return lambda: ssdr(motion, canonical, clusters, **SSDR | {"influences": influences})
+
+    monkeypatch.setattr(dem_bones, "prepare", twin)
+    monkeypatch.setattr(dem_bones, "skinning", lambda solved, canonical: solved)
+    found = measured(**PEER)
+    assert found["rmse_ratio"] == found["held_out_rmse_ratio"] == 1.0
+    assert found["bones_rmse_pct"] == found["peer_rmse_pct"] > 0
+    assert found["bones_count"] == found["peer_bones_count"] == 4
+    assert found["time_ratio"] == pytest.approx(found["seconds"] / found["peer_seconds"])
+    assert found["time_to_peer_rmse_ratio"] > 0  # the settings as shipped, if no quicker ones, reach their own error
+
+
+def test_an_error_that_is_never_reached_has_no_time(monkeypatch):
+    def exact(motion, canonical, **_):
+        return lambda: ssdr(motion, canonical, cluster(motion, canonical, **CLUSTERING), **SSDR | {"iterations": 40})
+
+    monkeypatch.setattr(dem_bones, "prepare", exact)  # three times the bones
+    monkeypatch.setattr(dem_bones, "skinning", lambda solved, canonical: solved)
+    found = measured(**PEER)
+    assert found["rmse_ratio"] > 1
+    assert "time_to_peer_rmse_ratio" not in found
+
+
+def test_dem_bones_is_read_as_it_measures_itself():
+    pytest.importorskip("py_dem_bones")
+    motion, canonical = bending_rod()
+    native = dem_bones.prepare(motion, canonical, bones=4, influences=2, **PEER)()
+    found = dem_bones.skinning(native, canonical)
+    assert found.weights.shape == (motion.points.shape[1], native.nB)
+    np.testing.assert_allclose(found.weights.sum(1), 1.0, atol=1e-6)
+    assert (found.weights > 0).sum(1).max() <= 2
+    rmse = vertex_rmse(skin(found.rest, found.weights, found.transforms), motion.points)
+    assert rmse == pytest.approx(native.rmse(), rel=1e-4)
+
+
+def test_bones_against_the_peer_itself():
+    pytest.importorskip("py_dem_bones")
+    found = measured(**PEER)
+    assert found["rmse_ratio"] < 1.1
+    assert found["peer_bones_count"] <= 4
+
+
+def test_curve_against_the_peer_itself():
+    pytest.importorskip("compas_cgal")
+    surface = shapes.surface(*shapes.capsules(WYE, 0.2, 0.08))
+    found = named(benchmark_skeleton(surface, tracing=SETTINGS, repeats=1, threads=1))
+    assert found["curve_leaves"] == found["peer_curve_leaves"] == 3
+    assert found["curve_cycles"] == found["peer_curve_cycles"] == 0
+    assert found["curve_mapped_pct"] == found["peer_curve_mapped_pct"] == 100.0
+
+
+def test_counts_of_a_graph_drawn_by_hand():
+    surface = shapes.surface(*shapes.sphere(2))
+    nodes = np.array([[0.0, 0, 0], [0.5, 0, 0], [0, 0.5, 0], [0, 0, 3.0]])
+    edges = np.array([[0, 1], [0, 2], [1, 2], [0, 3]])  # a triangle with a tail whose end is outside
+    times = np.ones(len(surface.vertices))
+    times[0], times[1] = 0, 2
+    found = counts(nodes, edges, times, surface)
+    share = 100.0 * (1 - 2 / len(times))
+    assert found == {
+        "curve_leaves": 1.0,
+        "curve_junctions": 1.0,
+        "curve_cycles": 1.0,
+        "curve_inside_pct": 75.0,
+        "curve_mapped_pct": pytest.approx(share),
+    }
+
+
+def test_segments_become_a_graph():
+    a, b, c = [0.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0]
+    nodes, edges, times = cgal.graph([(a, b), (b, c)], [([0, 1], [2]), ([2], [3, 1])], 5)
+    assert nodes.tolist() == [a, b, c]
+    assert edges.tolist() == [[0, 1], [1, 2]]
+    assert times.tolist() == [1, 2, 1, 1, 0]
+
+
+def test_a_missing_extra_says_what_to_install(monkeypatch):
+    for package in ("py_dem_bones", "compas_cgal.skeletonization"):
+        monkeypatch.setitem(sys.modules, package, None)
+    install = r'pip install -e "\.\[bench\]"'
+    with pytest.raises(InputError, match=install):
+        dem_bones.prepare(*bending_rod(), bones=2, influences=2, **PEER)
+    with pytest.raises(InputError, match=install):
+        cgal.prepare(shapes.surface(*shapes.sphere(1)))
+
+
+def test_bare_points_are_nothing_for_dem_bones():
+    motion, canonical = bending_rod()
+    with pytest.raises(InputError, match="faces"):
+        dem_bones.prepare(replace(motion, faces=None), canonical, bones=2, influences=2, **PEER)
+
+
+def test_both_take_turns_and_getting_ready_comes_first():
+    log = []
+
+    def prepare(who):
+        log.append(f"prepare {who}")
+        return lambda: log.append(who) or who
+
+    found = cost.in_turn(lambda: prepare("ours"), lambda: prepare("peer"), (2, 1))
+    assert log == ["prepare ours", "ours", "prepare peer", "peer", "prepare ours", "ours"]
+    assert [result for result, _ in found] == ["ours", "peer"]
+
+
+def test_median_of_times_and_most_memory():
+    costs = [cost.Cost(s, 2 * s, m) for s, m in ((3.0, 1.0), (1.0, 5.0), (2.0, None))]
+    assert cost.median(costs) == cost.Cost(2.0, 4.0, 5.0)
+
+
+def test_memory_at_the_peak_not_at_the_end():
+    _, found = cost.measure(lambda: np.ones(50 * 2**17).sum())
+    if found.memory is None:
+        pytest.skip("the system does not say")
+    assert 45 < found.memory < 75
+
+
+def test_threads_are_held_and_given_back(monkeypatch):
+    monkeypatch.setenv("SKELEBONES_THREADS", "7")
+    with cost.threads_held(2):
+        assert os.environ["SKELEBONES_THREADS"] == "2"
+    assert os.environ["SKELEBONES_THREADS"] == "7"
+    with cost.threads_held(0):
+        assert os.environ["SKELEBONES_THREADS"] == "7"

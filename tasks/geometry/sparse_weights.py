@@ -110,16 +110,18 @@ def _holds(support: np.ndarray, size: int, b: int) -> bool:
 
 @njit(cache=True, nogil=True)
 def _steepest(q, support, values, size, error, refused) -> int:
-    """The bone outside the support towards which w^T q w falls fastest, or -1 where none lowers it."""
-    add, slope = -1, error * (1.0 - 1e-6)
+    """The bone outside the support that lowers w^T q w most along the line from w to it, or -1 where none does."""
+    add, most = -1, 1e-6 * error
     for b in range(len(q)):
         if refused[b] or _holds(support, size, b):
             continue
         g = 0.0
         for i in range(size):
             g += q[b, support[i]] * values[i]
-        if g < slope:
-            add, slope = b, g
+        if g < error:
+            gain = (error - g) ** 2 / max(error - 2.0 * g + q[b, b], 1e-300)
+            if gain > most:
+                add, most = b, gain
     return add
 
 

@@ -10,6 +10,7 @@ import itertools
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from flows import source
 from flows.store import canonical_json
 
 
@@ -23,6 +24,7 @@ class Node:
     outputs: tuple[str, ...]
     settings: dict
     inputs: dict
+    source: str
     files: str
     cases: list[str] = field(default_factory=list)
 
@@ -64,7 +66,8 @@ class Graph:
         described = {n: _identity(v) for n, v in inputs.items()}
         text = canonical_json([stage, function, settings, list(outputs), described, files])
         identity = hashlib.sha256(text.encode()).hexdigest()
-        node = self.nodes.setdefault(identity, Node(identity, stage, function, outputs, settings, inputs, files))
+        code = source.digest(function.split(":")[0])
+        node = self.nodes.setdefault(identity, Node(identity, stage, function, outputs, settings, inputs, code, files))
         if case not in node.cases:
             node.cases.append(case)
         return node

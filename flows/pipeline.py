@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from flows import schema
 from flows.config import NO_ABLATION, Case
 from flows.graph import Graph, Node
+from flows.source import returns, signature
 
 PANELS = 4  # methods or variants side by side in the picture of errors
 
@@ -51,21 +52,23 @@ def plan(case: Case, graph: Graph) -> Planned:
 
 
 def _benchmark(case: Case, name: str, add) -> Planned:
-    """A stage of ours and a peer, timed in one stage of its own on the same data."""
+    """A stage of ours, timed in one stage of its own, beside a peer where there is one."""
     config, function = case.config, schema.BENCHMARKS[case.config["pipeline"]]
     nodes = _data(config, add)
-    if config["pipeline"] == "benchmark_bones":
+    if config["pipeline"] != "benchmark_skeleton":
         stages = {"clustering": schema.CLUSTER, "decomposition": schema.SSDR}
         own = {n: schema.arguments(f, config["bones"], config["seed"]) for n, f in stages.items()}
-        inputs = {n: nodes[n] for n in ("motion", "train", "test", "canonical")}
+        inputs = {n: nodes[n] for n in signature(function)[0]}
     else:
         own = {"tracing": schema.arguments(schema.CURVE, config["skeleton"]["curve"], config["seed"])}
         surface = config["skeleton"]["surface"]
         inputs = {
             "surface": add("surface", schema.SURFACE, surface, "surface", canonical=nodes["canonical"])["surface"]
         }
-    measured = add("benchmark", function, config["benchmark"] | own, "metrics", **inputs)
-    return Planned(case, name, (measured,), nodes)
+    outputs = "metrics picture" if "Picture" in returns(function) else "metrics"
+    measured = add("benchmark", function, config["benchmark"] | own, outputs, **inputs)
+    drawn = {"picture": measured["picture"]} if "picture" in measured.outputs else {}
+    return Planned(case, name, (measured,), nodes | drawn)
 
 
 def _data(config: dict, add) -> dict[str, Output]:
@@ -133,7 +136,7 @@ def _skeleton(settings: dict, add, train, test, canonical, skinning) -> dict[str
 
 def plan_pictures(planned: list[Planned], graph: Graph) -> list[Node]:
     """The figures of a report: for every dataset, its last case, and the errors of some methods or variants."""
-    found: list[Node] = []
+    found = [p.nodes["picture"][0] for p in planned if "picture" in p.nodes]
     planned = [p for p in planned if "skinning" in p.nodes]  # benchmarks make none
     for data in dict.fromkeys(p.case.data for p in planned):
         cases = [p for p in planned if p.case.data == data]

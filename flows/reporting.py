@@ -26,6 +26,10 @@ BENCHMARKS = {
             "Processor time, memory, bones": ("cpu_ratio", "memory", "peer_memory", "bones_count", "peer_bones_count"),
         },
     ),
+    "scale_bones": (
+        ("points_exponent", "frames_exponent", "points_count", "frames_count", "seconds", "memory"),
+        {},
+    ),
     "benchmark_skeleton": (
         ("time_ratio", "cpu_ratio", "seconds", "peer_seconds", "memory", "peer_memory"),
         {
@@ -102,12 +106,9 @@ def _tables(planned: list[Planned], rows, settings: dict) -> list:
         "stands_for": {name: node["stands_for"] for name, node in datasets.items() if node["stands_for"]},
         "baselines": settings["baselines"],
     }
+    if planned[0].case.config["pipeline"] in BENCHMARKS:
+        return _benchmark_tables(planned, rows, settings, common)
     tables = []
-    pipelines = dict.fromkeys(p.case.config["pipeline"] for p in planned)
-    for name in (n for n in pipelines if n in BENCHMARKS):
-        tables += _benchmark_tables([p for p in planned if p.case.config["pipeline"] == name], rows, settings, common)
-    if len(tables) and set(pipelines) <= set(BENCHMARKS):
-        return tables
     if rows["metric"].isin(UNSEEN).any():
         printed = {"paper": paper, "paper_table": settings["paper_table"]} if settings["paper_table"] else {}
         notes = _notes(planned, settings)
@@ -122,22 +123,24 @@ def _tables(planned: list[Planned], rows, settings: dict) -> list:
 
 
 def _benchmark_tables(planned: list[Planned], rows, settings: dict, common: dict) -> list:
-    """What was measured against a peer: the ratios first, then the numbers behind them."""
+    """What decides first, then the numbers behind it."""
     from tasks.evaluation.tables import build
 
-    first, others = BENCHMARKS[planned[0].case.config["pipeline"]]
-    chosen = rows[rows["method"].isin({p.case.method for p in planned})]
-    node = planned[0].case.config["benchmark"]
+    config = planned[0].case.config
+    first, others = BENCHMARKS[config["pipeline"]]
+    repeats = config["benchmark"]["repeats"]
+    runs = f"{repeats} runs of ours and {config['benchmark'].get('peer_repeats', repeats)} of the peer"
     notes = [
-        "A row is a peer. Ratios are ours / the peer's, timed in turn in one process with nothing beside it; below 1 ours is better.",
-        f"Medians of {node['repeats']} runs of ours and {node.get('peer_repeats', node['repeats'])} of the peer, timed "
-        "when the stage was computed: a run that takes it from the store shows the same times.",
+        f"Medians of {runs if others else f'{repeats} runs'}, timed when the stage was computed: a run that takes it "
+        "from the store shows the same times.",
         *([settings["note"]] if settings["note"] else []),
     ]
-    made = [build(chosen, title=settings["title"], metrics=first, notes=notes, **common)]
-    for title, metrics in others.items():
-        made.append(build(chosen, title=title, metrics=metrics, notes=[], **common))
-    return made
+    if others:
+        notes.insert(
+            0, "A row is a peer. Ratios are ours / the peer's, timed in turn in one process; below 1 is better."
+        )
+    made = [build(rows, title=settings["title"], metrics=first, notes=notes, **common)]
+    return made + [build(rows, title=title, metrics=metrics, notes=[], **common) for title, metrics in others.items()]
 
 
 def _curve(planned: list[Planned], rows, curve: list[str] | None) -> list:

@@ -35,6 +35,7 @@ EVALUATE_RIG = "tasks.evaluation.rig:evaluate_rig"
 BENCHMARKS = {
     "benchmark_bones": "tasks.benchmarks.bones:benchmark_bones",
     "benchmark_skeleton": "tasks.benchmarks.skeleton:benchmark_skeleton",
+    "scale_bones": "tasks.benchmarks.scale:scale_bones",
 }
 
 REPORT = {
@@ -78,12 +79,12 @@ def schema(config: dict) -> dict[str, object]:
             **{name: settings(function) for name, function in JOINTS.items()},
         }
     bones = {"kind": Literal["ssdr", "clusters"], **settings(CLUSTER)}
-    if pipeline == "benchmark_bones":
+    if pipeline in ("benchmark_bones", "scale_bones"):
         bones["kind"] = Literal["ssdr"]
     bones |= settings(SSDR if config["bones"].get("kind") != "clusters" else RIGID)
     return {
         "seed": int,
-        "pipeline": Literal["animate", "rig", "benchmark_bones", "benchmark_skeleton"],
+        "pipeline": Literal["animate", "rig", "benchmark_bones", "benchmark_skeleton", "scale_bones"],
         "dataset": {
             "kind": str,
             "status": Literal["paper", "substitute"],

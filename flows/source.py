@@ -39,26 +39,11 @@ def signature(function: str) -> tuple[tuple[str, ...], dict[str, object]]:
 
 
 @cache
-def returns(function: str) -> str:
-    """The return annotation of ``"package.module:function"`` as text."""
-    module, name = function.split(":")
-    for node in _tree(module).body:
-        if isinstance(node, ast.FunctionDef) and node.name == name:
-            return ast.unparse(node.returns) if node.returns else ""
-    raise LookupError(f"{module} has no function {name}")
-
-
-@cache
-def annotations(function: str) -> dict[str, str]:
-    """Positional names -> annotation text."""
-    module, name = function.split(":")
-    node = next(n for n in _tree(module).body if isinstance(n, ast.FunctionDef) and n.name == name)
-    return {a.arg: ast.unparse(a.annotation) if a.annotation else "" for a in node.args.args}
-
-
-@cache
 def digest(module: str) -> str:
-    """Digest of a module of ``tasks`` and of all of ``tasks`` that it imports, comments and docstrings left out."""
+    """Digest of a module of ``tasks`` and of all of ``tasks`` that it imports, comments and docstrings left out.
+
+    Only for the main thread: CPython 3.11's parser fails at random when several threads use it.
+    """
     seen: dict[str, str] = {}
     pending = [module]
     while pending:

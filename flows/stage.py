@@ -12,12 +12,11 @@ import importlib
 import json
 import threading
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
-from flows import source
 from flows.store import Ref, Store, canonical_json, explained
 from tasks.values import Training
 
@@ -28,8 +27,8 @@ FORMAT = 1  # raise it when the store's layout changes
 class Job:
     """All that a worker needs to run one stage, picklable and small.
 
-    inputs: argument -> (Ref, output name), or for a composite argument a dict of those; files: digest of the input
-    files that the settings name; case: what readers call it.
+    inputs: argument -> (Ref, output name), or for a composite argument a dict of those; source: digest of the
+    function's code; files: digest of the input files that the settings name; case: what readers call it.
     """
 
     stage: str
@@ -37,11 +36,11 @@ class Job:
     outputs: tuple[str, ...]
     settings: dict
     inputs: dict
+    source: str
     files: str
     case: str
     store: str
     events: str | None = None
-    extra: dict = field(default_factory=dict)
 
 
 def key_of(job: Job) -> str:
@@ -53,7 +52,7 @@ def key_of(job: Job) -> str:
         "format": FORMAT,
         "stage": job.stage,
         "function": job.function,
-        "source": source.digest(job.function.split(":")[0]),
+        "source": job.source,
         "outputs": job.outputs,
         "settings": settings,
         "inputs": _digests(job.inputs),
@@ -138,7 +137,7 @@ def _compute(job: Job, store: Store) -> dict[str, object]:
     one_blas_thread()
     module, name = job.function.split(":")
     function = getattr(importlib.import_module(module), name)
-    kinds = source.annotations(job.function)
+    kinds = function.__annotations__  # as text
     inputs = {n: _load(store, value, kinds.get(n, "")) for n, value in job.inputs.items()}
     result = function(**inputs, **job.settings)
     values = result if isinstance(result, tuple) else (result,)

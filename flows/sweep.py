@@ -172,7 +172,16 @@ def _job(node: Node, refs: dict[str, Ref], store: str, events: str) -> Job:
 
     inputs = {n: resolve(v) for n, v in node.inputs.items()}
     return Job(
-        node.stage, node.function, node.outputs, node.settings, inputs, node.files, short(node.cases), store, events
+        stage=node.stage,
+        function=node.function,
+        outputs=node.outputs,
+        settings=node.settings,
+        inputs=inputs,
+        source=node.source,
+        files=node.files,
+        case=short(node.cases),
+        store=store,
+        events=events,
     )
 
 

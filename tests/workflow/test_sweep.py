@@ -158,6 +158,7 @@ def job(folder: Path, **changes) -> Job:
         "outputs": ("out",),
         "settings": {"value": 1.0, "log": str(folder / "log.txt")},
         "inputs": {},
+        "source": "s",
         "files": "",
         "case": "case",
         "store": str(folder / "store"),
@@ -171,6 +172,7 @@ def test_key_ignores_names_and_places_and_heeds_content(tmp_path):
     assert key == key_of(job(tmp_path, settings={"value": 1, "log": str(tmp_path / "log.txt")}))
     assert key != key_of(job(tmp_path, settings={"value": 2.0, "log": str(tmp_path / "log.txt")}))
     assert key != key_of(job(tmp_path, function=f"{TOY}:double"))
+    assert key != key_of(job(tmp_path, source="another"))
     place = {"value": 1.0, "log": "", "path": "/a/x.npz"}
     moved = {"value": 1.0, "log": "", "path": "/b/x.npz"}
     assert key_of(job(tmp_path, settings=place, files="d")) == key_of(job(tmp_path, settings=moved, files="d"))

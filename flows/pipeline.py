@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from flows import schema
 from flows.config import NO_ABLATION, Case
 from flows.graph import Graph, Node
-from flows.source import returns, signature
+from flows.source import signature
 
 PANELS = 4  # methods or variants side by side in the picture of errors
 
@@ -65,7 +65,7 @@ def _benchmark(case: Case, name: str, add) -> Planned:
         inputs = {
             "surface": add("surface", schema.SURFACE, surface, "surface", canonical=nodes["canonical"])["surface"]
         }
-    outputs = "metrics picture" if "Picture" in returns(function) else "metrics"
+    outputs = "metrics picture" if config["pipeline"] == "scale_bones" else "metrics"
     measured = add("benchmark", function, config["benchmark"] | own, outputs, **inputs)
     drawn = {"picture": measured["picture"]} if "picture" in measured.outputs else {}
     return Planned(case, name, (measured,), nodes | drawn)

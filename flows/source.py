@@ -39,6 +39,16 @@ def signature(function: str) -> tuple[tuple[str, ...], dict[str, object]]:
 
 
 @cache
+def returns(function: str) -> str:
+    """The return annotation of ``"package.module:function"`` as text."""
+    module, name = function.split(":")
+    for node in _tree(module).body:
+        if isinstance(node, ast.FunctionDef) and node.name == name:
+            return ast.unparse(node.returns) if node.returns else ""
+    raise LookupError(f"{module} has no function {name}")
+
+
+@cache
 def digest(module: str) -> str:
     """Digest of a module of ``tasks`` and of all of ``tasks`` that it imports, comments and docstrings left out.
 

@@ -11,6 +11,7 @@ import pytest
 
 from tasks.benchmarks import cgal, cost, dem_bones
 from tasks.benchmarks.bones import benchmark_bones
+from tasks.benchmarks.scale import scale_bones, subdivided
 from tasks.benchmarks.skeleton import benchmark_skeleton, counts
 from tasks.bones.clustering import cluster
 from tasks.bones.ssdr import ssdr
@@ -174,3 +175,34 @@ def test_threads_are_held_and_given_back(monkeypatch):
     assert os.environ["SKELEBONES_THREADS"] == "7"
     with cost.threads_held(0):
         assert os.environ["SKELEBONES_THREADS"] == "7"
+
+
+def test_finer_meshes_are_the_same_surface_and_move_with_it():
+    motion, canonical = bending_rod(frames=3)
+    fine, shape = subdivided(motion, canonical)
+    points, triangles = motion.points.shape[1], len(motion.faces)
+    assert len(fine.faces) == 4 * triangles
+    assert fine.points.shape[1] == points + 3 * triangles // 2  # a middle for every edge of a closed surface
+    np.testing.assert_array_equal(fine.points[:, :points], motion.points)
+    for frame, coarse in zip([*fine.points, shape.points], [*motion.points, canonical.points], strict=True):
+        assert shapes.volume(frame, fine.faces) == pytest.approx(shapes.volume(coarse, motion.faces), rel=1e-5)
+
+
+def test_scale_times_every_size_and_draws_them():
+    motion, canonical = bending_rod()
+    settings = {"subdivisions": 1, "shares": [0.5, 1.0], "repeats": 1, "threads": 1}
+    metrics, picture = scale_bones(motion, canonical, **OURS, **settings)
+    found = named(metrics)
+    points = motion.points.shape[1]
+    sizes = {name.split("@")[1] for name in found if "@" in name}
+    assert sizes == {f"{points}x6", f"{points}x12", f"{4 * points - 6}x12"}  # Euler's formula, a closed surface
+    assert found["points_count"] == 4 * points - 6
+    assert np.isfinite([found["points_exponent"], found["frames_exponent"]]).all()
+    assert picture.svg.startswith("<svg")
+
+
+@pytest.mark.parametrize("wrong", [{"shares": [1.0]}, {"shares": [0.0, 1.0]}, {"subdivisions": 0}, {"repeats": 0}])
+def test_scale_settings_out_of_range_are_named(wrong):
+    settings = {"subdivisions": 1, "shares": [0.5, 1.0], "repeats": 1, "threads": 1} | wrong
+    with pytest.raises(InputError, match=next(iter(wrong))):
+        scale_bones(*bending_rod(frames=3), **OURS, **settings)

@@ -6,6 +6,7 @@ import base64
 import re
 from pathlib import Path
 
+STEP = 5  # per cent
 LARGEST_FIGURE = 400_000  # bytes; larger pictures stay in the report's folder
 
 
@@ -33,11 +34,11 @@ class ProgressArtifact:
         self._id = create_progress_artifact(progress=0.0, key=f"{key(name)}-progress", description="stages finished")
 
     def update(self, finished: int) -> None:
-        """Moves the bar; told only when a whole per cent has passed."""
+        """Moves the bar, in steps that are worth a call to the server."""
         from prefect.artifacts import update_progress_artifact
 
         percent = 100 * finished // self._total
-        if percent > self._percent:
+        if percent >= self._percent + STEP or finished == self._total:
             self._percent = percent
             update_progress_artifact(self._id, progress=float(percent))
 

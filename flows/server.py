@@ -14,7 +14,7 @@ import sys
 import threading
 import time
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 STARTUP_SECONDS = 180  # a slow machine needs more than the usual 20
 
@@ -31,40 +31,53 @@ def quiet_prefect() -> None:
 
 
 @contextlib.contextmanager
-def server() -> Iterator[str]:
-    """The address of the API: the user's server if one is configured, else one that lives as long as this block."""
+def server() -> Iterator[Callable[[], str]]:
+    """A function that gives the API's address once it answers: the user's server if one is configured, else one that
+    lives as long as this block and starts while the caller does something else."""
     quiet_prefect()
-    from prefect.settings import PREFECT_API_URL, PREFECT_LOGGING_TO_API_ENABLED, temporary_settings
+    from prefect.settings import PREFECT_API_URL
 
-    configured = PREFECT_API_URL.value()
+    configured = PREFECT_API_URL.value()  # from the environment or the user's profile
     if configured:
-        yield configured
+        yield lambda: configured
         return
     port = free_port()
     url = f"http://127.0.0.1:{port}/api"
-    child = subprocess.Popen(
+    child = _start(port)
+    log: list[bytes] = []
+    threading.Thread(target=lambda: log.extend(child.stderr), daemon=True).start()
+    with contextlib.ExitStack() as settings:
+        try:
+            yield lambda: _use(url, child, log, settings)
+        finally:
+            for name in ("PREFECT_API_URL", "PREFECT_LOGGING_TO_API_ENABLED"):
+                os.environ.pop(name, None)
+            child.stdin.close()
+            try:
+                child.wait(10)
+            except subprocess.TimeoutExpired:
+                child.kill()
+
+
+def _start(port: int) -> subprocess.Popen:
+    return subprocess.Popen(
         [sys.executable, "-m", "flows.server", str(port)],
         stdin=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         cwd=os.path.dirname(os.path.dirname(os.path.abspath(__file__))),
     )
-    log: list[bytes] = []
-    threading.Thread(target=lambda: log.extend(child.stderr), daemon=True).start()
-    try:
-        _wait(url, child, log)
-        # nobody will read the logs of a server that ends with the run; worker processes get both from the environment
-        os.environ |= {"PREFECT_API_URL": url, "PREFECT_LOGGING_TO_API_ENABLED": "false"}
-        with temporary_settings({PREFECT_API_URL: url, PREFECT_LOGGING_TO_API_ENABLED: False}):
-            yield url
-    finally:
-        for name in ("PREFECT_API_URL", "PREFECT_LOGGING_TO_API_ENABLED"):
-            os.environ.pop(name, None)
-        child.stdin.close()
-        try:
-            child.wait(10)
-        except subprocess.TimeoutExpired:
-            child.kill()
+
+
+def _use(url: str, child: subprocess.Popen, log: list[bytes], settings: contextlib.ExitStack) -> str:
+    """Points Prefect at the server, here and in worker processes. Nobody will read the logs of a server that ends with
+    the run, so they are not sent."""
+    from prefect.settings import PREFECT_API_URL, PREFECT_LOGGING_TO_API_ENABLED, temporary_settings
+
+    _wait(url, child, log)
+    os.environ |= {"PREFECT_API_URL": url, "PREFECT_LOGGING_TO_API_ENABLED": "false"}
+    settings.enter_context(temporary_settings({PREFECT_API_URL: url, PREFECT_LOGGING_TO_API_ENABLED: False}))
+    return url
 
 
 def free_port() -> int:

@@ -58,13 +58,19 @@ def digest(module: str) -> str:
     pending = [module]
     while pending:
         name = pending.pop()
-        if name in seen:
-            continue
-        tree = _tree(name)
-        seen[name] = ast.unparse(_without_docstrings(tree))
-        pending.extend(_imports(tree))
+        if name not in seen:
+            seen[name], needs = _code(name)
+            pending.extend(needs)
     text = "\n".join(f"# {name}\n{seen[name]}" for name in sorted(seen))
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+@cache
+def _code(module: str) -> tuple[str, list[str]]:
+    """A module's code without comments and docstrings, and what of ``tasks`` it imports."""
+    tree = _tree(module)
+    needs = _imports(tree)
+    return ast.unparse(_without_docstrings(ast.parse(_source(module)))), needs
 
 
 def has(module: str) -> bool:
@@ -82,6 +88,7 @@ def _source(module: str) -> str:
     return _path(module).read_text("utf-8")
 
 
+@cache
 def _tree(module: str) -> ast.Module:
     return ast.parse(_source(module))
 
@@ -126,4 +133,4 @@ def choices(folder: str, function: str, what: str, name: str) -> str:
 
 
 def _defines(module: str, function: str) -> bool:
-    return any(isinstance(node, ast.FunctionDef) and node.name == function for node in _tree(module).body)
+    return f"\ndef {function}(" in _source(module)

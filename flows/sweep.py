@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from flows.config import Case
 from flows.graph import Graph, Node, short
@@ -14,6 +15,9 @@ from flows.server import server
 from flows.stage import Job, run
 from flows.store import CorruptArtefact, Ref, Store
 from tasks.errors import InputError
+
+if TYPE_CHECKING:
+    from flows.reporting import Report
 
 ATTEMPTS = 3  # how often damaged artefacts are dropped and computed again before giving up
 
@@ -39,10 +43,11 @@ def run_sweep(cases: list[Case], show: bool = True) -> Path:
     """
     config = cases[0].config
     Store(config["store"]["path"])  # a store that cannot be used is said before anything starts
-    graph = Graph()
-    planned = [plan(case, graph) for case in cases]
-    pictures = plan_pictures(planned, graph) if config["report"]["figures"] else []
-    with server():
+    with server() as ready:
+        graph = Graph()
+        planned = [plan(case, graph) for case in cases]
+        pictures = plan_pictures(planned, graph) if config["report"]["figures"] else []
+        ready()
         return Path(_flow(config, graph, planned, pictures, show)(config["report"]["name"], len(cases)))
 
 
@@ -52,19 +57,38 @@ def _flow(config: dict, graph: Graph, planned: list[Planned], pictures: list[Nod
 
     @flow(name=config["report"]["name"], task_runner=task_runner(config["runner"]), validate_parameters=False)
     def sweep(experiment: str, cases: int) -> str:
-        from flows.artifacts import publish
-        from flows.reporting import write
+        from flows.artifacts import ProgressArtifact, publish
 
-        with Progress(graph, show) as progress:
-            outcome = compute(graph, config, progress)
-            raise_first(graph, outcome)
-            store = Store(config["store"]["path"])
-            report = write(planned, pictures, graph, outcome.refs, outcome.computed, store)
+        bar = ProgressArtifact(experiment, len(graph.nodes))
+        with Progress(graph, show, bar.update) as progress:
+            report, computed = _computed_report(config, graph, planned, pictures, progress)
         publish(report.folder, report.tables)
-        progress.finish(report.shown, report.folder, len(outcome.computed))
+        progress.finish(report.shown, report.folder, computed)
         return str(report.folder)
 
     return sweep
+
+
+def _computed_report(
+    config: dict, graph: Graph, planned: list[Planned], pictures: list[Node], progress: Progress
+) -> tuple[Report, int]:
+    """The report and how many stages were computed for it."""
+    from flows.reporting import write
+
+    store = Store(config["store"]["path"])
+    computed: set[str] = set()
+    for attempt in range(1, ATTEMPTS + 1):
+        outcome = compute(graph, config, progress)
+        computed |= outcome.computed
+        raise_first(graph, outcome)
+        try:
+            return write(planned, pictures, graph, outcome.refs, computed, store), len(computed)
+        except CorruptArtefact as error:
+            if attempt == ATTEMPTS:
+                raise
+            store.drop(error.stage, error.key)
+            progress.note(f"{error}: it is computed again")
+    raise AssertionError("not reached")
 
 
 def compute(graph: Graph, config: dict, progress: Progress) -> Outcome:

@@ -28,5 +28,5 @@ def prefect_server():
     from flows.server import server
 
     os.environ.pop("PREFECT_API_URL", None)  # never the user's
-    with server() as url:
-        yield url
+    with server() as ready:
+        yield ready()

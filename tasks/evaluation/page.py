@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import base64
+import struct
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from jinja2 import Environment
 from markupsafe import Markup
 
-from tasks.evaluation import render, typeset
+from tasks.evaluation import typeset
 from tasks.evaluation.tables import Table
 from tasks.values import Picture
 
@@ -142,9 +143,10 @@ def _short(checksum: object) -> str:
 
 def _inline(picture: Picture) -> Markup:
     """The picture inside the page: a drawing as it is, pixels as a data URI."""
-    if picture.pixels is None:
+    if picture.png is None:
         return Markup(picture.svg)
-    data = base64.b64encode(render.png(picture.pixels)).decode()
-    height, width = picture.pixels.shape[:2]
+    content = picture.png.tobytes()
+    width, height = struct.unpack(">II", content[16:24])  # a PNG file begins with its size
+    data = base64.b64encode(content).decode()
     tag = Markup('<img src="data:image/png;base64,{}" width="{}" height="{}" alt="{}">')
     return tag.format(data, width, height, picture.caption)

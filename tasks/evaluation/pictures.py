@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from tasks.evaluation import figures
+import numpy as np
+
+from tasks.evaluation import figures, render
 from tasks.geometry import measure
 from tasks.values import Animation, Canonical, Clusters, Motion, Parts, Picture, Skeleton, Skinning
 
@@ -13,28 +15,32 @@ def error_picture(test: Motion, canonical: Canonical, animations: dict[str, Anim
     diagonal = measure.diagonal(canonical.points)
     pixels = figures.error_figure(test, shown, diagonal, focus=focus, azimuth=figures.azimuth_of(test))
     caption = f"{test.name}: vertex error on unseen clips, median and worst frame of {focus}"
-    return Picture("errors", caption, pixels)
+    return Picture("errors", caption, _png(pixels))
 
 
 def skeleton_picture(train: Motion, canonical: Canonical, skeleton: Skeleton, parts: Parts) -> Picture:
     """The skeleton inside the canonical shape, joints in the colour of their part."""
     pixels = figures.skeleton_figure(canonical, skeleton, parts, azimuth=figures.azimuth_of(train))
-    return Picture("skeleton", f"{train.name}: inner skeleton, joints in the colour of their part", pixels)
+    return Picture("skeleton", f"{train.name}: inner skeleton, joints in the colour of their part", _png(pixels))
 
 
 def parts_picture(train: Motion, canonical: Canonical, skinning: Skinning, parts: Parts) -> Picture:
     """How much each point follows each part."""
     pixels = figures.parts_figure(canonical, skinning, parts, azimuth=figures.azimuth_of(train))
-    return Picture("parts", f"{train.name}: overlapping parts, matched on their own", pixels)
+    return Picture("parts", f"{train.name}: overlapping parts, matched on their own", _png(pixels))
 
 
 def bones_picture(train: Motion, canonical: Canonical, skinning: Skinning) -> Picture:
     """The free-form bones' weights."""
     pixels = figures.bones_figure(canonical, skinning, azimuth=figures.azimuth_of(train))
-    return Picture("bones", f"{train.name}: skin weights of the free-form bones", pixels)
+    return Picture("bones", f"{train.name}: skin weights of the free-form bones", _png(pixels))
 
 
 def count_picture(train: Motion, canonical: Canonical, clusters: Clusters) -> Picture:
     """Error against the number of clusters, with the chosen number."""
     drawing = figures.count_figure(clusters, measure.diagonal(canonical.points))
     return Picture("count", f"{train.name}: error of rigid clusters against their number", None, drawing)
+
+
+def _png(pixels: np.ndarray) -> np.ndarray:
+    return np.frombuffer(render.png(pixels), np.uint8)

@@ -20,7 +20,7 @@ from typing import Any
 import pandas as pd
 
 from tasks.errors import InputError
-from tasks.evaluation import page, render, typeset
+from tasks.evaluation import page, typeset
 from tasks.evaluation.rows import to_csv
 from tasks.evaluation.tables import Table
 from tasks.values import Picture
@@ -67,10 +67,10 @@ def contents(
     links = []
     for subject, picture in figures:
         stem = re.sub(r"[^A-Za-z0-9_.-]+", "_", f"{subject}_{picture.name}")
-        name = f"figures/{stem}.{'svg' if picture.pixels is None else 'png'}"
+        name = f"figures/{stem}.{'svg' if picture.png is None else 'png'}"
         if name in drawn:
             raise ValueError(f"two figures are called {name}")
-        drawn[name] = picture.svg.encode() if picture.pixels is None else render.png(picture.pixels)
+        drawn[name] = picture.svg.encode() if picture.png is None else picture.png.tobytes()
         links.append(f"![{picture.caption}]({name})\n\n*{picture.caption}*\n")
     texts = {
         "metrics.csv": to_csv(rows),

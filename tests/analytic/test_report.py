@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from tasks.errors import InputError
-from tasks.evaluation import page, report
+from tasks.evaluation import page, render, report
 from tasks.evaluation.report import write_report
 from tasks.evaluation.rows import from_csv, rows_of
 from tasks.evaluation.tables import build
 from tasks.values import Metrics, Picture
 
-PIXELS = Picture("errors", "errors <of> all", np.full((4, 6, 3), 200, np.uint8))
+PIXELS = Picture("errors", "errors <of> all", np.frombuffer(render.png(np.full((4, 6, 3), 200, np.uint8)), np.uint8))
 DRAWING = Picture("count", "count", None, '<svg xmlns="http://www.w3.org/2000/svg"></svg>')
 PROVENANCE = {
     "command": ["python", "-m", "flows.run"],

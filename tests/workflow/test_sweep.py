@@ -179,6 +179,11 @@ def test_key_ignores_names_and_places_and_heeds_content(tmp_path):
     assert key_of(job(tmp_path, settings=place, files="d")) != key_of(job(tmp_path, settings=place, files="e"))
 
 
+def _forget_sources() -> None:
+    for cached in (source.digest, source._code, source._tree, source._source):
+        cached.cache_clear()
+
+
 def test_source_digest_heeds_code_not_comments(tmp_path, monkeypatch):
     package = tmp_path / "tasks"
     package.mkdir()
@@ -189,15 +194,13 @@ def test_source_digest_heeds_code_not_comments(tmp_path, monkeypatch):
 
     def digest(text: str) -> str:
         two.write_text(text)
-        source.digest.cache_clear()
-        source._source.cache_clear()
+        _forget_sources()
         return source.digest("tasks.one")
 
     first = digest("def b():\n    return 1\n")
     assert digest("# why\ndef b():\n    '''One.'''\n    return 1  # one\n") != digest("def b():\n    return 2\n")
     assert digest("def b():  # a comment\n    return 1\n") == first
-    source.digest.cache_clear()
-    source._source.cache_clear()
+    _forget_sources()
 
 
 def test_lock_waits_for_an_equal_job(tmp_path):

@@ -33,8 +33,8 @@ BENCHMARKS = {
     "benchmark_skeleton": (
         ("time_ratio", "cpu_ratio", "seconds", "peer_seconds", "memory", "peer_memory"),
         {
-            "Ends and forks": ("curve_leaves", "peer_curve_leaves", "curve_junctions", "peer_curve_junctions"),
-            "Loops": ("curve_cycles", "peer_curve_cycles"),
+            "Ends": ("curve_leaves", "peer_curve_leaves", "peer_curve_limbs"),
+            "Forks and loops": ("curve_junctions", "peer_curve_junctions", "curve_cycles", "peer_curve_cycles"),
             "Nodes inside, vertices mapped": (
                 *("curve_inside_pct", "peer_curve_inside_pct"),
                 *("curve_mapped_pct", "peer_curve_mapped_pct"),
@@ -123,8 +123,8 @@ def _tables(planned: list[Planned], rows, settings: dict) -> list:
 
 
 def _benchmark_tables(planned: list[Planned], rows, settings: dict, common: dict) -> list:
-    """What decides first, then the numbers behind it."""
-    from tasks.evaluation.tables import build
+    """What decides first, then the numbers behind it; rows are subjects and columns peers, for few are compared."""
+    from tasks.evaluation.tables import build, unranked
 
     config = planned[0].case.config
     first, others = BENCHMARKS[config["pipeline"]]
@@ -136,11 +136,16 @@ def _benchmark_tables(planned: list[Planned], rows, settings: dict, common: dict
         *([settings["note"]] if settings["note"] else []),
     ]
     if others:
-        notes.insert(
-            0, "A row is a peer. Ratios are ours / the peer's, timed in turn in one process; below 1 is better."
-        )
-    made = [build(rows, title=settings["title"], metrics=first, notes=notes, **common)]
-    return made + [build(rows, title=title, metrics=metrics, notes=[], **common) for title, metrics in others.items()]
+        notes.insert(0, "Ratios are ours / the peer's, timed in turn in one process; below 1 is better.")
+    several = rows["dataset"].nunique() > 1
+    subject = rows["dataset"] + " " + rows["subject"] if several else rows["subject"]
+    turned = rows.assign(dataset=rows["method"], subject="", method=subject)
+    common |= {"data_status": {}, "stands_for": {}, "baselines": []}
+
+    def table(title: str, metrics: tuple[str, ...], notes: list[str]):
+        return unranked(build(turned, title=title, metrics=metrics, notes=notes, **common))
+
+    return [table(settings["title"], first, notes), *(table(t, metrics, []) for t, metrics in others.items())]
 
 
 def _curve(planned: list[Planned], rows, curve: list[str] | None) -> list:

@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import igl
 import numpy as np
+from scipy.spatial import cKDTree
 
 from tasks.benchmarks import cgal
 from tasks.benchmarks.cost import in_turn, numbers, threads_held
 from tasks.errors import InputError
 from tasks.evaluation.metrics import declared
 from tasks.geometry.neighbours import components
+from tasks.skeleton import graph
 from tasks.skeleton.curve import curve_skeleton
 from tasks.values import Curve, Metrics, Surface
 
@@ -22,7 +24,8 @@ def benchmark_skeleton(surface: Surface, *, tracing: dict, repeats: int, threads
 
     tracing: the settings of :func:`curve_skeleton`; repeats: runs whose median is taken, after one that only warms up;
     threads: 0 for all cores. Leaves have one edge, junctions three or more; inside is the share of nodes with a winding
-    number above a half; mapped is the share of the surface's vertices that belong to exactly one node. Raises
+    number above a half; mapped is the share of the surface's vertices that belong to exactly one node; limbs are
+    the peer's leaves once its short branches are dropped by the rule that ours follow (``twig``). Raises
     InputError where the extra is missing or a setting out of range.
     """
     if repeats < 1:
@@ -38,8 +41,17 @@ def benchmark_skeleton(surface: Surface, *, tracing: dict, repeats: int, threads
         (curve, mine), (found, theirs) = in_turn(lambda: ours, lambda: peer, (repeats, repeats))
     mapped = (curve.of_vertex >= 0) & (curve.of_vertex < len(curve.nodes))  # one node each, by its shape
     shape = counts(curve.nodes, curve.edges, mapped.astype(int), surface)
-    shape |= {f"peer_{name}": value for name, value in counts(*cgal.graph(*found, count), surface).items()}
+    nodes, edges, times = cgal.graph(*found, count)
+    shape |= {f"peer_{name}": value for name, value in counts(nodes, edges, times, surface).items()}
+    shape["peer_curve_limbs"] = float(limbs(nodes, edges, surface, tracing["twig"]))
     return declared(numbers(mine, theirs) | shape, "unit")
+
+
+def limbs(nodes: np.ndarray, edges: np.ndarray, surface: Surface, twig: float) -> int:
+    """Leaves that are left without the branches shorter than `twig` inner radii of the body where they begin."""
+    radius = cKDTree(surface.vertices.astype(np.float64)).query(nodes)[0]
+    edges = graph.drop_twigs(nodes, edges, np.zeros(0, int), twig * radius)[1]
+    return int(np.sum(np.bincount(edges.ravel()) == 1))
 
 
 def counts(nodes: np.ndarray, edges: np.ndarray, times: np.ndarray, surface: Surface) -> dict[str, float]:

@@ -87,6 +87,7 @@ METRICS: dict[str, Metric] = {
     "curve_inside_pct": Metric("inside", "percent", "higher", "share of the curve's nodes inside the body", 1),
     "curve_mapped_pct": Metric("mapped once", "percent", "higher", "surface vertices that belong to one node", 1),
     "peer_curve_leaves": Metric("peer's leaves", "count", "none", "ends of the peer's curve skeleton", 0),
+    "peer_curve_limbs": Metric("peer's limbs", "count", "none", "its ends without branches as short as ours drop", 0),
     "peer_curve_junctions": Metric("peer's junctions", "count", "none", "its nodes of three or more branches", 0),
     "peer_curve_cycles": Metric("peer's cycles", "count", "none", "its loops", 0),
     "peer_curve_inside_pct": Metric("peer's inside", "percent", "none", "share of its nodes inside the body", 1),

@@ -147,6 +147,15 @@ def ranks(values: Sequence[float | None], better: str) -> list[int]:
     return [0 if s is None else {order[0]: 1, order[1]: 2}.get(s, 0) for s in scores]
 
 
+def unranked(table: Table) -> Table:
+    """The table without marks for the best: its rows are not rivals."""
+
+    def plain(column: Column) -> Column:
+        return replace(column, cells=tuple(replace(cell, rank=0) for cell in column.cells))
+
+    return replace(table, columns=tuple(plain(column) for column in table.columns))
+
+
 def digits_for(values: Sequence[float], metric: str) -> int:
     """Decimals for a column: the metric's own, or as many as give its largest value three significant digits."""
     own = metric_of(metric).digits

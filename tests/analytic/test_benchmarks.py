@@ -12,7 +12,7 @@ import pytest
 from tasks.benchmarks import cgal, cost, dem_bones
 from tasks.benchmarks.bones import benchmark_bones
 from tasks.benchmarks.scale import scale_bones, subdivided
-from tasks.benchmarks.skeleton import benchmark_skeleton, counts
+from tasks.benchmarks.skeleton import benchmark_skeleton, counts, limbs
 from tasks.bones.clustering import cluster
 from tasks.bones.ssdr import ssdr
 from tasks.errors import InputError
@@ -118,6 +118,14 @@ def test_counts_of_a_graph_drawn_by_hand():
         "curve_inside_pct": 75.0,
         "curve_mapped_pct": pytest.approx(share),
     }
+
+
+def test_short_branches_are_no_limbs():
+    surface = shapes.surface(*shapes.sphere(3))
+    nodes = np.array([[0.0, 0, 0], [1.2, 0, 0], [-1.2, 0, 0], [0, 0.4, 0]])
+    edges = np.array([[0, 1], [0, 2], [0, 3]])  # the third is shorter than the radius of 1
+    assert limbs(nodes, edges, surface, 1.0) == 2
+    assert limbs(nodes, edges, surface, 0.3) == 3
 
 
 def test_segments_become_a_graph():

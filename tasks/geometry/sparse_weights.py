@@ -102,7 +102,8 @@ def _solve_point(q: np.ndarray, start: np.ndarray, influences: int, exchanges: i
 
 @njit(cache=True, nogil=True)
 def _holds(support: np.ndarray, size: int, b: int) -> bool:
-    for i in range(size):
+    # a generator would not compile
+    for i in range(size):  # noqa: SIM110
         if support[i] == b:
             return True
     return False

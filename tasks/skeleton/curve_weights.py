@@ -26,10 +26,6 @@ class Interpolation:
         """Values of the points (N, ...) onto the vertices (V, ...), float64."""
         return np.einsum("vk,vk...->v...", self.share, values[self.corner].astype(np.float64))
 
-    def carry_paths(self, points: np.ndarray) -> np.ndarray:
-        """Moving points (F, N, 3) onto the vertices (F, V, 3), float32."""
-        return np.stack([self.carry(frame) for frame in points]).astype(np.float32)
-
 
 def onto_surface(canonical: Canonical, surface: Surface) -> Interpolation:
     """On a mesh the closest point of its triangles, on bare points the inverse-distance mean of the nearest."""
@@ -42,6 +38,16 @@ def onto_surface(canonical: Canonical, surface: Surface) -> Interpolation:
     _, triangle, closest = igl.point_mesh_squared_distance(vertices, points, faces)
     corner = faces[triangle]
     return Interpolation(corner, _barycentric(closest, points[corner]))
+
+
+def thin(canonical: Canonical, surface: Surface, curve: Curve, most: int) -> np.ndarray:
+    """Numbers of at most ``most`` canonical points, spread evenly along the curve; all where there are no more."""
+    count = len(canonical.points)
+    if count <= most:
+        return np.arange(count)
+    along = np.argsort(curve.of_vertex, kind="stable")
+    chosen = along[np.unique(np.linspace(0, len(along) - 1, most).round().astype(np.int64))]
+    return np.unique(cKDTree(canonical.points).query(surface.vertices[chosen])[1])
 
 
 def node_weights(curve: Curve, on_surface: np.ndarray) -> np.ndarray:

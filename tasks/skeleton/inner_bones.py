@@ -1,32 +1,30 @@
-"""From free-form bones to the few that turn about joints inside the body.
-
-Everything works on the vertices of the closed surface: they are even, of one piece and of one number, whatever the
-data's points are like.
-"""
+"""From free-form bones to the few that turn about joints inside the body."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse.csgraph import connected_components
 
+from tasks.geometry import rigid
+from tasks.geometry.measure import vertex_rmse
 from tasks.geometry.moments import fit_rigid, skin_moments
-from tasks.geometry.neighbours import adjacency, mesh_edges
-from tasks.geometry.rotations import geodesic
+from tasks.geometry.rotations import geodesic, project_so3
+from tasks.geometry.skinning import skin
 from tasks.geometry.sparse_weights import fit_weights
-from tasks.skeleton.curve_weights import node_lengths, node_weights
-from tasks.values import Curve, Surface
 
-_SUPPORT = 0.1  # a bone holds the vertices where it weighs more than this
 _EXCHANGES = 2
 _SWEEPS = 2
+_SUPPORT = 0.02  # bones that weigh more than this on a point that the dropped bone also held are looked at again
+_TRACE = 1e-3  # weights below do not count
+_SLOWEST, _FASTEST, _FASTER = 0.4, 0.95, 0.05  # Nesterov's extrapolation: start, most, growth a round
+_SMALLEST = 0.004  # of the diagonal: extent below which a bone's angle would be noise
 
 
 @dataclass(frozen=True)
 class Bones:
-    """Bones on the surface. rest: (V, 3), paths: (F, V, 3) where its vertices are and go; weights: (V, B);
-    transforms: (F, B, 3, 4); influences: most bones a vertex may have."""
+    """Bones and the points they move. rest: (N, 3); paths: (F, N, 3); weights: (N, B); transforms: (F, B, 3, 4);
+    influences: most bones a point may have."""
 
     rest: np.ndarray
     paths: np.ndarray
@@ -34,99 +32,116 @@ class Bones:
     transforms: np.ndarray
     influences: int
 
-    def keep(self, chosen: np.ndarray) -> Bones:
-        """Only the chosen bones, every vertex's weights fitted anew."""
-        return self.with_transforms(self.transforms[:, chosen], self.weights[:, chosen])
+    @property
+    def count(self) -> int:
+        """Number of bones B."""
+        return self.weights.shape[1]
 
-    def with_transforms(self, transforms: np.ndarray, start: np.ndarray) -> Bones:
-        """Other transforms, every vertex's weights fitted to them."""
+    def refit(self, transforms: np.ndarray, start: np.ndarray) -> Bones:
+        """Other transforms; every point's weights fitted to them from the support of ``start``."""
         weights = fit_weights(
             self.rest, self.paths, transforms, influences=self.influences, exchanges=_EXCHANGES, start=start
         )
         return Bones(self.rest, self.paths, weights, transforms, self.influences)
 
+    def keep(self, chosen: np.ndarray) -> Bones:
+        """Only the chosen bones."""
+        return self.refit(self.transforms[:, chosen], self.weights[:, chosen])
+
     def improve(self, rounds: int) -> Bones:
-        """Rounds of SSDR: transforms, then weights."""
-        bones = self
+        """Rounds of SSDR (transforms, then weights) with Nesterov's extrapolation of the transforms between them."""
+        bones, ahead, best, speed = self, self.transforms, np.inf, _SLOWEST
         for _ in range(rounds):
             moments = skin_moments(bones.rest, bones.weights, bones.paths)
-            bones = bones.with_transforms(fit_rigid(moments, bones.transforms, _SWEEPS), bones.weights)
+            new = bones.refit(fit_rigid(moments, ahead, _SWEEPS), bones.weights)
+            error = new.error()
+            if error > best:
+                ahead, speed = new.transforms, _SLOWEST
+            else:
+                ahead = new.transforms + speed * (new.transforms - bones.transforms)
+                ahead = rigid.make(project_so3(ahead[..., :3]), ahead[..., 3])
+                speed, best = min(_FASTEST, speed + _FASTER), error
+            bones = new
         return bones
 
+    def error(self) -> float:
+        """Vertex RMSE."""
+        return vertex_rmse(skin(self.rest, self.weights, self.transforms), self.paths)
 
-def inner_bones(
-    bones: Bones, surface: Surface, curve: Curve, *, least: float, rounds: int, angle: float, at_most: int
-) -> Bones:
-    """Bones that dominate some piece of the curve, none twice, none split over the body.
 
-    least: share of the vertices below which a bone is dust; rounds: rounds of SSDR between the two filters;
-    angle: bones that touch and never (98 % of the frames) turn more than this many degrees apart are one;
-    at_most: bones left; where there are more, the pairs most alike are joined too.
+def rigid_pieces(bones: Bones, labels: np.ndarray, least: int) -> Bones:
+    """One bone for every piece of points (N,) of at least ``least`` points, moving as the piece moves as a whole: away
+    from blends that fit the points but lie on no limb, and one bone no longer serves both ears."""
+    sizes = np.bincount(labels)
+    large = np.flatnonzero(sizes >= least)
+    if len(large) == 0:
+        large = np.array([int(np.argmax(sizes))])
+    member = (labels[:, None] == large).astype(np.float32)
+    start = rigid.identity(len(bones.paths), len(large), dtype=np.float64)
+    transforms = fit_rigid(skin_moments(bones.rest, member, bones.paths), start, 1)
+    return bones.refit(transforms, member)
+
+
+def prune(bones: Bones, size: float, *, angle: float, at_most: int) -> Bones:
+    """Drops the bone whose absence the others make up for best, again and again, each time with a round of SSDR, until
+    no more than ``at_most`` are left and each of them carries its points more than ``angle`` degrees away from where
+    the others could (:func:`absence`). size: the shape's diagonal."""
+    missed = absence(bones, np.arange(bones.count), size)
+    while bones.count > 1:
+        drop = int(np.argmin(missed[:, 1]))
+        if missed[drop, 0] >= np.radians(angle) and bones.count <= at_most:
+            break
+        held = bones.weights[:, drop] > _SUPPORT
+        near = ((bones.weights > _SUPPORT) & held[:, None]).any(axis=0)
+        others = np.delete(np.arange(bones.count), drop)
+        bones, missed, near = bones.keep(others).improve(1), missed[others], np.flatnonzero(near[others])
+        missed[near] = absence(bones, near, size)
+    return bones
+
+
+def absence(bones: Bones, which: np.ndarray, size: float) -> np.ndarray:
+    """What the motion loses without a bone when its points may take other bones: (K, 2).
+
+    First an angle in radians: the RMS distance by which its points then miss, over the extent of these points. It
+    does not depend on how many points there are, so that an ear counts as much as a leg. Second the key by which
+    bones are compared: the square of that angle times the root of the bone's share of the points.
     """
-    bones = clean(split(bones, surface.faces, least), least)
-    bones = bones.keep(dominant_on_curve(bones, curve)).improve(rounds)
-    bones = bones.keep(dominant_on_curve(bones, curve)).improve(2)
-    bones = merge(bones, curve, angle, at_most)
-    return bones.keep(dominant_on_curve(bones, curve))
-
-
-def split(bones: Bones, faces: np.ndarray, least: float) -> Bones:
-    """A bone whose support falls into several pieces of the surface (two ears that move alike) becomes several."""
-    near = adjacency(mesh_edges(faces), len(bones.rest))
-    weights, origin = [], []
-    for b in range(bones.weights.shape[1]):
-        w = bones.weights[:, b]
-        held = np.flatnonzero(w > _SUPPORT)
-        if len(held) == 0:
+    now = np.sum((skin(bones.rest, bones.weights, bones.transforms) - bones.paths) ** 2, axis=(0, 2), dtype=np.float64)
+    out = np.zeros((len(which), 2))
+    for i, b in enumerate(which):
+        held = np.flatnonzero(bones.weights[:, b] > _TRACE)
+        others = np.delete(np.arange(bones.count), b)
+        if len(held) == 0 or len(others) == 0:
             continue
-        count, label = connected_components(near[held][:, held], directed=False)
-        sizes = np.bincount(label, minlength=count)
-        large = np.flatnonzero(sizes >= max(3, least * len(w)))
-        for piece in large if len(large) else [int(np.argmax(sizes))]:
-            column = np.zeros(len(w), np.float32)
-            column[held[label == piece]] = w[held[label == piece]]
-            weights.append(column)
-            origin.append(b)
-    weights = np.stack(weights, axis=1)
-    total = weights.sum(axis=1, keepdims=True)
-    lone = total[:, 0] <= 0
-    weights = weights / np.where(total > 0, total, 1.0)
-    weights[lone] = fit_weights(
-        bones.rest[lone], bones.paths[:, lone], bones.transforms[:, origin], influences=1, exchanges=0
-    )
-    moments = skin_moments(bones.rest, weights, bones.paths)
-    transforms = fit_rigid(moments, bones.transforms[:, origin], _SWEEPS)
-    return Bones(bones.rest, bones.paths, weights, transforms, bones.influences)
+        few = Bones(bones.rest[held], bones.paths[:, held], bones.weights[held], bones.transforms, bones.influences)
+        few = few.keep(others)
+        then = np.sum((skin(few.rest, few.weights, few.transforms) - few.paths) ** 2, axis=(0, 2), dtype=np.float64)
+        mass = bones.weights[held, b].astype(np.float64) ** 2
+        centre = mass @ few.rest / mass.sum()
+        extent = np.sqrt(mass @ np.sum((few.rest - centre) ** 2, axis=1) / mass.sum())
+        lost = max(float(np.sum(then - now[held])), 0.0) / len(bones.paths) / mass.sum()
+        squared = lost / max(extent, _SMALLEST * size) ** 2
+        out[i] = np.sqrt(squared), squared * np.sqrt(mass.sum() / len(bones.rest))
+    return out
 
 
-def clean(bones: Bones, least: float) -> Bones:
-    """Without the bones that dominate next to no vertex."""
-    share = np.bincount(bones.weights.argmax(axis=1), minlength=bones.weights.shape[1]) / len(bones.rest)
-    return bones.keep(np.flatnonzero(share >= least))
-
-
-def dominant_on_curve(bones: Bones, curve: Curve) -> np.ndarray:
-    """Numbers of the bones that weigh most at some node of the curve."""
-    return np.unique(node_weights(curve, bones.weights).argmax(axis=1))
-
-
-def merge(bones: Bones, curve: Curve, angle: float, at_most: int) -> Bones:
-    """Joins touching bones, the most alike first, until every pair turns more than ``angle`` degrees apart
-    and no more than ``at_most`` are left."""
-    while bones.weights.shape[1] > 1:
-        turn = relative_turn(bones.transforms)
-        turn[overlap(curve, bones.weights) <= 1e-3 * node_lengths(curve).mean()] = np.inf
+def merge_alike(bones: Bones, overlap: np.ndarray, angle: float) -> Bones:
+    """Joins bones that touch (overlap (B, B) > 0) and in 98 % of the frames turn less than ``angle`` degrees apart."""
+    while bones.count > 1:
+        turn = np.where(overlap > 0, relative_turn(bones.transforms), np.inf)
         np.fill_diagonal(turn, np.inf)
         a, b = np.unravel_index(int(np.argmin(turn)), turn.shape)
-        if not np.isfinite(turn[a, b]) or (turn[a, b] > np.radians(angle) and len(turn) <= at_most):
+        if turn[a, b] > np.radians(angle):
             break
         weights = bones.weights.copy()
         weights[:, a] += weights[:, b]
-        chosen = np.delete(np.arange(weights.shape[1]), b)
-        transforms = fit_rigid(
-            skin_moments(bones.rest, weights[:, chosen], bones.paths), bones.transforms[:, chosen], _SWEEPS
-        )
-        bones = Bones(bones.rest, bones.paths, weights[:, chosen], transforms, bones.influences)
+        others = np.delete(np.arange(bones.count), b)
+        joined = overlap.copy()
+        joined[a] += overlap[b]
+        joined[:, a] += overlap[:, b]
+        overlap = joined[np.ix_(others, others)]
+        moments = skin_moments(bones.rest, weights[:, others], bones.paths)
+        bones = bones.refit(fit_rigid(moments, bones.transforms[:, others], _SWEEPS), weights[:, others])
     return bones
 
 
@@ -138,9 +153,3 @@ def relative_turn(transforms: np.ndarray) -> np.ndarray:
     for b in range(count):
         out[b] = np.percentile(geodesic(r, r[:, b : b + 1]), 98.0, axis=0)
     return out
-
-
-def overlap(curve: Curve, weights: np.ndarray) -> np.ndarray:
-    """(B, B) length of curve on which two bones share: the integral of w_a w_b. weights: (V, B)."""
-    on_curve = node_weights(curve, weights)
-    return on_curve.T @ (on_curve * node_lengths(curve)[:, None])

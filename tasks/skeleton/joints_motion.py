@@ -7,27 +7,51 @@ from typing import Literal
 
 import igl
 import numpy as np
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from tasks.errors import InputError
 from tasks.geometry.measure import diagonal
+from tasks.geometry.neighbours import adjacency, mesh_edges
 from tasks.skeleton.articulation import centres
-from tasks.skeleton.curve_weights import Interpolation, node_lengths, node_weights, onto_surface
-from tasks.skeleton.inner_bones import Bones, inner_bones, relative_turn
-from tasks.skeleton.refit import refit
+from tasks.skeleton.curve_weights import Interpolation, node_lengths, node_weights, onto_surface, thin
+from tasks.skeleton.inner_bones import Bones, merge_alike, prune, relative_turn, rigid_pieces
+from tasks.skeleton.refit import refit, spread_weights
 from tasks.skeleton.runs import find_runs
 from tasks.skeleton.tree import joint_names, kinematic_tree, link_components
 from tasks.values import Canonical, Curve, Motion, Skeleton, Skinning, Surface
 
 _PULL = 0.003
 _SOFT = 0.03  # of the diagonal: a joint with this residual stays about where the curve puts it
-_FRAMES = 200  # frames that the tree is found from; the refit sees all
+_FRAMES, _POINTS = 100, 2500  # looked at while bones are pruned; the refit sees more
+_REFIT_FRAMES, _REFIT_POINTS = 300, 6000
+_WARM_UP = 3  # rounds of SSDR before pruning
+
+
+@dataclass(frozen=True)
+class Body:
+    """What joints are looked for on. surface, curve: of the canonical shape; carry: from the bones' points to the
+    surface; size: the shape's diagonal."""
+
+    surface: Surface
+    curve: Curve
+    carry: Interpolation
+    size: float
+
+    def on_curve(self, weights: np.ndarray) -> np.ndarray:
+        """Weights of the bones' points (N, B) on the curve's nodes (M, B)."""
+        return node_weights(self.curve, self.carry.carry(weights))
+
+    def dominant(self, bones: Bones) -> Bones:
+        """Only the bones that weigh most at some node of the curve: the others move skin but no limb."""
+        return bones.keep(np.unique(self.on_curve(bones.weights).argmax(axis=1)))
 
 
 @dataclass(frozen=True)
 class Articulation:
-    """Bones and the places where they meet. bones: on the surface; links: (L, 2) bone numbers; points: (L, 3) their
-    joints; residuals: (L,) gap between both bones' idea of the joint, in units of the diagonal; costs: (L,) for the
-    spanning tree; middles: (B, 3) each bone's centre on the curve."""
+    """Bones and the places where they meet. links: (L, 2) bone numbers; points: (L, 3) their joints; residuals: (L,)
+    gap between both bones' idea of the joint, as a share of the diagonal; costs: (L,) for the spanning tree;
+    middles: (B, 3) each bone's centre on the curve."""
 
     bones: Bones
     links: np.ndarray
@@ -47,6 +71,7 @@ def joints_by_motion(
     max_joints: int,
     topology: Literal["auto", "motion", "curve"],
     rigid_residual: float,
+    missed: float,
     angle: float,
     least: float,
     shortest: float,
@@ -55,49 +80,57 @@ def joints_by_motion(
     refits: int,
     influences: int,
 ) -> Skeleton:
-    """Inner bones (:mod:`inner_bones`), joints where two of them carry the same point along (:mod:`articulation`), a
-    tree over them, then weights and joints refitted to the motion (:mod:`refit`). One joint a bone: a joint owns the
-    points that its bone moves; there are no end effectors.
+    """Few bones that explain the motion (:mod:`tasks.skeleton.inner_bones`), joints where two of them carry the same
+    point along (:mod:`tasks.skeleton.articulation`), a tree over them, then weights and joints refitted to the motion
+    (:mod:`tasks.skeleton.refit`). One joint a bone: it owns the points that its bone moves; no end effectors.
 
-    topology: ``motion`` takes the spanning tree of least joint gap, which is right for articulated bodies; ``curve``
-    keeps the curve's own tree, which does not tangle under cloth and soft tissue; ``auto`` takes the first where its
-    median gap is under ``rigid_residual`` (share of the diagonal). angle: degrees below which two bones are one;
-    least: share of the surface below which a bone is dust; shortest: run of curve below which a bone is dropped
-    (curve topology), reach: how far a joint may lie from the place on the curve where its bones meet, both as shares
-    of the diagonal; rounds: rounds of SSDR on the inner bones; refits: rounds of refitting; influences: most joints
-    a point may follow. Lengths are shares of the bounding-box diagonal. Raises InputError for settings out of range.
+    max_joints: most joints; topology: ``motion`` takes the spanning tree of least joint gap, which is right for
+    articulated bodies; ``curve`` keeps the curve's own tree, which does not tangle under cloth and soft tissue;
+    ``auto`` takes the first where its median gap is under ``rigid_residual``; missed: degrees by which a bone's points
+    must miss without it, or it goes; angle: degrees below which two bones that touch are one; least: share of the
+    points below which a piece is no bone to start from; shortest: run of curve below which a bone is dropped (curve
+    topology); reach: how far a joint may lie from where its bones meet on the curve; rounds: rounds of SSDR once the
+    bones are chosen; refits: rounds of refitting; influences: most joints a point may follow. Lengths are shares of
+    the bounding-box diagonal. Raises InputError for settings out of range.
     """
-    _check_settings(max_joints, influences, angle)
+    _check_settings(max_joints, influences, angle, missed)
     size = diagonal(canonical.points)
-    bones = _bones_on_surface(train, skinning, onto_surface(canonical, surface), canonical, influences)
-    bones = inner_bones(bones, surface, curve, least=least, rounds=rounds, angle=angle, at_most=max_joints)
-    found = by_motion(bones, curve, size, reach)
+    chosen = thin(canonical, surface, curve, _POINTS)
+    body = Body(surface, curve, onto_surface(_sampled(canonical, chosen), surface), size)
+    frames = _spread(train.frames, _FRAMES)
+    bones = _bones(train, canonical, skinning, frames, chosen, influences)
+    bones = few_bones(bones, body, at_most=max_joints, missed=missed, angle=angle, least=least, rounds=rounds)
+    found = by_motion(bones, body, reach)
     if topology == "curve" or (topology == "auto" and np.median(_tree_residuals(found)) > rigid_residual):
-        found = by_curve(bones, curve, size, reach, shortest=shortest, angle=angle, rounds=rounds)
-    parents, joints, weights = _assemble(found, canonical, surface, curve)
-    joints, weights = refit(
-        train.points,
-        canonical.points,
-        parents,
-        joints,
-        weights,
-        rounds=refits,
-        influences=influences,
-        reach=reach * size,
+        found = by_curve(bones, body, reach, shortest=shortest, angle=angle)
+    order, parents, joints = _assemble(found, body)
+    joints, weights = _fit_skeleton(
+        train, canonical, body, parents, joints, found.bones.transforms[:, order], frames, refits, influences, reach
     )
-    joints = keep_inside(joints, surface, curve)
     return Skeleton(joint_names(len(joints)), parents, joints.astype(np.float32), weights)
 
 
-def by_motion(bones: Bones, curve: Curve, size: float, reach: float) -> Articulation:
+def few_bones(
+    bones: Bones, body: Body, *, at_most: int, missed: float, angle: float, least: float, rounds: int
+) -> Bones:
+    """From the free bones to those that a skeleton needs."""
+    label = _pieces(bones, body)
+    bones = rigid_pieces(bones, label, max(4, round(least * len(bones.rest)))).improve(_WARM_UP)
+    bones = body.dominant(prune(bones, body.size, angle=missed, at_most=at_most).improve(rounds)).improve(rounds)
+    on_curve = body.on_curve(bones.weights)
+    shared = on_curve.T @ (on_curve * node_lengths(body.curve)[:, None])
+    return merge_alike(bones, np.where(shared > 1e-3 * node_lengths(body.curve).mean(), shared, 0.0), angle)
+
+
+def by_motion(bones: Bones, body: Body, reach: float) -> Articulation:
     """Every pair of bones that shares some curve is a candidate; a gap, a joint far from the shared curve and a small
     share all make it dear."""
-    on_curve, length = node_weights(curve, bones.weights), node_lengths(curve)
+    curve, size = body.curve, body.size
+    on_curve, length = body.on_curve(bones.weights), node_lengths(curve)
     edges = link_components(curve.nodes, curve.edges)
-    label = on_curve.argmax(axis=1)
+    meet = on_curve.argmax(axis=1)[edges]
     shared = on_curve.T @ (on_curve * length[:, None])
     candidates = shared > 1e-3 * length.mean()
-    meet = label[edges]
     candidates[meet[:, 0], meet[:, 1]] = candidates[meet[:, 1], meet[:, 0]] = True  # so that the graph is connected
     pairs = np.argwhere(np.triu(candidates, 1))
     share = on_curve[:, pairs[:, 0]] * on_curve[:, pairs[:, 1]] * length[:, None] + 1e-12
@@ -109,32 +142,28 @@ def by_motion(bones: Bones, curve: Curve, size: float, reach: float) -> Articula
     return Articulation(bones, pairs, points, residuals / size, costs, _middles(on_curve * length[:, None], curve))
 
 
-def by_curve(
-    bones: Bones, curve: Curve, size: float, reach: float, *, shortest: float, angle: float, rounds: int
-) -> Articulation:
+def by_curve(bones: Bones, body: Body, reach: float, *, shortest: float, angle: float) -> Articulation:
     """The curve's own tree: a bone for every run of nodes that one bone dominates, a joint where two runs meet."""
+    curve, size = body.curve, body.size
     edges, length = link_components(curve.nodes, curve.edges), node_lengths(curve)
     runs = find_runs(
         curve.nodes.astype(np.float64),
         edges,
-        node_weights(curve, bones.weights),
+        body.on_curve(bones.weights),
         length,
         relative_turn(bones.transforms),
         shortest=shortest * size,
         angle=np.radians(angle),
     )
-    member = np.zeros((len(bones.rest), len(runs.bone)), np.float32)
-    member[np.arange(len(member)), runs.of_node[curve.of_vertex]] = 1.0
     transforms = bones.transforms[:, runs.bone]
-    bones = Bones(bones.rest, bones.paths, member, transforms, bones.influences)
     pull = np.full(len(runs.links), _PULL)
     _, residuals = centres(transforms, runs.links, runs.boundary, pull, reach * size)
     pull = _PULL + (residuals / size / _SOFT) ** 2
     points, residuals = centres(transforms, runs.links, runs.boundary, pull, reach * size)
     share = np.zeros((len(curve.nodes), len(runs.bone)))
     share[np.arange(len(share)), runs.of_node] = length + 1e-12
-    costs = np.ones(len(runs.links))
-    return Articulation(bones, runs.links, points, residuals / size, costs, _middles(share, curve))
+    bones = Bones(bones.rest, bones.paths, bones.weights[:, runs.bone], transforms, bones.influences)
+    return Articulation(bones, runs.links, points, residuals / size, np.ones(len(runs.links)), _middles(share, curve))
 
 
 def keep_inside(joints: np.ndarray, surface: Surface, curve: Curve) -> np.ndarray:
@@ -154,17 +183,57 @@ def keep_inside(joints: np.ndarray, surface: Surface, curve: Curve) -> np.ndarra
     return out
 
 
-def _bones_on_surface(
-    train: Motion, skinning: Skinning, carry: Interpolation, canonical: Canonical, influences: int
-) -> Bones:
-    chosen = np.unique(np.linspace(0, train.frames - 1, min(train.frames, _FRAMES)).round().astype(np.int64))
+def _fit_skeleton(train, canonical, body, parents, joints, transforms, frames, refits, influences, reach):
+    """Joints and weights refitted on a part of points and frames, then all points' weights in one go."""
+    chosen = thin(canonical, body.surface, body.curve, _REFIT_POINTS)
+    rest = canonical.points[chosen].astype(np.float64)
+    start = Bones(rest, train.points[frames][:, chosen], np.zeros((len(rest), len(joints))), transforms, influences)
+    more = _spread(train.frames, _REFIT_FRAMES)
+    joints, weights = refit(
+        train.points[more][:, chosen],
+        rest,
+        parents,
+        joints,
+        start.refit(transforms, start.weights).weights,
+        rounds=refits,
+        influences=influences,
+        reach=reach * body.size,
+    )
+    joints = keep_inside(joints, body.surface, body.curve)
+    if len(chosen) < len(canonical.points):
+        weights = spread_weights(train.points[more], canonical.points, parents, joints, chosen, weights, influences)
+    return joints, weights
+
+
+def _bones(train: Motion, canonical: Canonical, skinning: Skinning, frames, points, influences: int) -> Bones:
     return Bones(
-        carry.carry(canonical.points),
-        carry.carry_paths(train.points[chosen]),
-        carry.carry(skinning.weights).astype(np.float32),
-        skinning.transforms[chosen].astype(np.float64),
+        canonical.points[points].astype(np.float64),
+        train.points[frames][:, points],
+        skinning.weights[points],
+        skinning.transforms[frames].astype(np.float64),
         influences,
     )
+
+
+def _pieces(bones: Bones, body: Body) -> np.ndarray:
+    """(N,) label of the connected piece of the surface that one bone dominates; every point takes its vertex's."""
+    on_surface = body.carry.carry(bones.weights).argmax(axis=1)
+    edges = mesh_edges(body.surface.faces)
+    inside = on_surface[edges[:, 0]] == on_surface[edges[:, 1]]
+    _, piece = connected_components(adjacency(edges[inside], len(on_surface)), directed=False)
+    near = cKDTree(body.surface.vertices).query(bones.rest)[1]
+    return piece[near]
+
+
+def _spread(frames: int, most: int) -> np.ndarray:
+    return np.unique(np.linspace(0, frames - 1, min(frames, most)).round().astype(np.int64))
+
+
+def _sampled(canonical: Canonical, chosen: np.ndarray) -> Canonical:
+    """The chosen points as bare points; the whole shape where all are chosen."""
+    if len(chosen) == len(canonical.points):
+        return canonical
+    return Canonical(canonical.points[chosen], None, canonical.frame, canonical.source)
 
 
 def _tree_residuals(found: Articulation) -> np.ndarray:
@@ -177,22 +246,19 @@ def _tree_residuals(found: Articulation) -> np.ndarray:
     return np.array([found.residuals[at[_pair(order[j], order[parents[j]])]] for j in range(1, count)])
 
 
-def _assemble(
-    found: Articulation, canonical: Canonical, surface: Surface, curve: Curve
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Parents (J,), joints (J, 3) and the points' weights (N, J). The root is the bone nearest the centroid; its joint
-    lies on the curve, in the bone's middle."""
-    centroid = canonical.points.mean(axis=0, dtype=np.float64)
-    root = int(np.argmin(np.linalg.norm(found.middles - centroid, axis=1)))
+def _assemble(found: Articulation, body: Body) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Order of the bones (J,), parents (J,) and joints (J, 3). The root is the bone that carries most of the surface:
+    the pelvis or the chest, while the one nearest the centroid is often the neck. Its joint lies on the curve, in the
+    bone's middle."""
+    root = int(np.argmax(body.carry.carry(found.bones.weights).sum(axis=0)))
     order, parents = kinematic_tree(found.links, found.costs, root, len(found.middles))
     at = _link_of(found.links)
     joints = np.empty((len(order), 3))
-    nodes = curve.nodes.astype(np.float64)
+    nodes = body.curve.nodes.astype(np.float64)
     joints[0] = nodes[np.linalg.norm(nodes - found.middles[root], axis=1).argmin()]
     for j in range(1, len(order)):
         joints[j] = found.points[at[_pair(order[j], order[parents[j]])]]
-    weights = found.bones.weights[:, order][surface.of_point]
-    return parents, joints, np.ascontiguousarray(weights)
+    return order, parents, joints
 
 
 def _pair(a: int, b: int) -> tuple[int, int]:
@@ -208,11 +274,12 @@ def _middles(share: np.ndarray, curve: Curve) -> np.ndarray:
     return (share.T @ curve.nodes) / share.sum(axis=0)[:, None]
 
 
-def _check_settings(max_joints: int, influences: int, angle: float) -> None:
+def _check_settings(max_joints: int, influences: int, angle: float, missed: float) -> None:
     for name, value, low, high in (
         ("max_joints", max_joints, 1, 500),
         ("influences", influences, 1, 16),
         ("angle", angle, 0.0, 90.0),
+        ("missed", missed, 0.0, 90.0),
     ):
         if not low <= value <= high:
             raise InputError(f"skeleton.motion.{name}", expected=f"{low} to {high}", found=str(value))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from tasks.geometry.moments import Moments, skin_moments
 from tasks.geometry.sparse_weights import fit_weights
@@ -45,10 +46,38 @@ def refit(
         if reach > 0:
             joints, root = fit_joints(parents, joints, moments, world, root, anchor=start, reach=reach)
         transforms = transforms_of(parents, joints, world, root)
-        used = np.flatnonzero(~empty)
-        weights = np.zeros_like(weights, dtype=np.float32)
-        weights[:, used] = fit_weights(rest, points, transforms[:, used], influences=influences, exchanges=2)
+        weights = _fit(rest, points, transforms, weights, ~empty, influences)
     return joints + origin, weights
+
+
+def spread_weights(
+    points: np.ndarray,
+    rest: np.ndarray,
+    parents: np.ndarray,
+    joints: np.ndarray,
+    chosen: np.ndarray,
+    weights: np.ndarray,
+    influences: int,
+) -> np.ndarray:
+    """Weights of all points (N, J) for the poses that the chosen points and their weights (K, J) take."""
+    origin = rest.mean(axis=0, dtype=np.float64)
+    points, rest, joints = points - origin.astype(np.float32), rest - origin, joints - origin
+    moments = skin_moments(rest[chosen], weights, points[:, chosen])
+    world, root = warm_start(parents, joints, moments, _STIFFNESS)
+    world, root = solve_poses(parents, joints, moments, world, root, steps=_FIRST_STEPS, damping=_DAMPING)
+    transforms = transforms_of(parents, joints, world, root)
+    start = weights[cKDTree(rest[chosen]).query(rest)[1]]
+    return _fit(rest, points, transforms, start, weights.sum(axis=0) > 0, influences)
+
+
+def _fit(rest, points, transforms, start, used, influences) -> np.ndarray:
+    """Weights for the used joints only."""
+    out = np.zeros((len(rest), transforms.shape[1]), np.float32)
+    chosen = np.flatnonzero(used)
+    out[:, chosen] = fit_weights(
+        rest, points, transforms[:, chosen], influences=influences, exchanges=2, start=start[:, chosen]
+    )
+    return out
 
 
 def fit_joints(

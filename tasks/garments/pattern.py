@@ -10,7 +10,9 @@ from typing import Literal
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
+from scipy.spatial import cKDTree
 
+from tasks.garments.body import largest_component
 from tasks.garments.retarget import to_poses, zero_pose
 from tasks.geometry import kinematics
 from tasks.geometry.skinning import skin
@@ -47,7 +49,7 @@ def cut(
     """
     joints = _joints(body)
     vertices = _posed(body)
-    axes = _axes(vertices, joints, length)
+    axes = _axes(joints, length)
     distance = _distance(vertices, body.faces, axes)
     x, y, z = np.meshgrid(*axes, indexing="ij")
     top, hips = joints["LeftArm"][1], joints["Hips"][1]
@@ -190,7 +192,7 @@ def _posed(body: Motion) -> np.ndarray:
     return skin(body.rest, rig.weights, transforms)[0].astype(np.float64)
 
 
-def _axes(vertices: np.ndarray, joints: dict[str, np.ndarray], length: float) -> list[np.ndarray]:
+def _axes(joints: dict[str, np.ndarray], length: float) -> list[np.ndarray]:
     low = np.array([-0.55, length - 0.06, -0.5])
     high = np.array([0.55, joints["Head"][1], 0.5])
     return [np.arange(a, b, GRID) for a, b in zip(low, high, strict=True)]
@@ -202,8 +204,6 @@ def _distance(vertices: np.ndarray, faces: np.ndarray, axes: list[np.ndarray]) -
 
     shape = tuple(len(a) for a in axes)
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    from scipy.spatial import cKDTree
-
     far, _ = cKDTree(vertices).query(grid, distance_upper_bound=0.09)
     out = np.full(len(grid), 0.08)
     near = np.isfinite(far)
@@ -258,7 +258,5 @@ def _openings(points: np.ndarray, joints: dict[str, np.ndarray], *, garment: str
 
 
 def _largest(points: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    from tasks.garments.body import largest_component
-
     kept, faces = largest_component(faces, len(points))
     return points[kept], faces

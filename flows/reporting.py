@@ -103,7 +103,11 @@ def _tables(planned: list[Planned], rows, settings: dict) -> list:
     common = {
         "labels": {p.case.method: p.case.config["animate"]["label"] for p in planned},
         "data_status": {name: node["status"] for name, node in datasets.items()},
-        "stands_for": {name: node["stands_for"] for name, node in datasets.items() if node["stands_for"]},
+        "stands_for": {
+            f"{dataset}/{subject}": datasets[dataset]["stands_for"]
+            for dataset, subject in rows[["dataset", "subject"]].drop_duplicates().itertuples(index=False)
+            if datasets[dataset]["stands_for"]
+        },
         "baselines": settings["baselines"],
     }
     if planned[0].case.config["pipeline"] in BENCHMARKS:

@@ -92,7 +92,7 @@ def error_figure(
             row.append(_panel(shape, cameras[i], points[frame], error_map(errors[name][i] / top), lines, theme))
         rows.append(np.hstack(row))
     sheet = np.vstack(rows)
-    return render.finish(np.hstack([sheet, _bar(len(sheet), error_map, top, unit, theme)]))
+    return render.finish(_row([sheet, _bar(len(sheet), error_map, top, unit, theme)], theme))
 
 
 def overlay_figure(
@@ -119,7 +119,7 @@ def overlay_figure(
         rows.append(np.hstack(row))
     names = ["overlay", "result", "truth"]
     legend = _legend(sum(len(row) for row in rows), names, [None, tint[1], tint[0]], theme)
-    return render.finish(np.hstack([np.vstack(rows), legend]))
+    return render.finish(_row([np.vstack(rows), legend], theme))
 
 
 def skeleton_figure(
@@ -137,12 +137,11 @@ def skeleton_figure(
     sides = [_cameras(points[None], azimuth + turn)[0] for turn in (0.0, 0.5 * np.pi)]
     glass = {"opacity": 0.16, "rim": 0.5}
     pictures = [_panel(shape, side, points, CLAY * 0.9, lines, theme, joints, **glass) for side in sides]
-    pictures = _level(pictures, theme)
     if parts is None:
-        return render.finish(np.hstack(pictures))
+        return render.finish(_row(pictures, theme))
     names = [f"{len(skeleton.parents)} joints", *parts.names]
-    legend = _legend(len(pictures[0]), names, [None, *part_colours(len(parts.names))], theme)
-    return render.finish(np.hstack([*pictures, legend]))
+    legend = _legend(max(map(len, pictures)), names, [None, *part_colours(len(parts.names))], theme)
+    return render.finish(_row([*pictures, legend], theme))
 
 
 def parts_figure(
@@ -176,7 +175,7 @@ def bones_figure(canonical: Canonical, skinning: Skinning, *, azimuth: float, th
         _panel(shape, front, points, weight_map((shared - 1) / 3), ["bones that share a point"], theme),
     ]
     bar = _bar(len(pictures[0]), weight_map, 4.0, "bones", theme, low=1.0)
-    return render.finish(np.hstack([*pictures, bar]))
+    return render.finish(_row([*pictures, bar], theme))
 
 
 def count_figure(clusters: Clusters, diagonal: float) -> str:
@@ -246,8 +245,8 @@ def _grid(pictures: list[np.ndarray], columns: int, theme: str) -> np.ndarray:
     return np.vstack([np.hstack(every[i : i + columns]) for i in range(0, len(every), columns)])
 
 
-def _level(pictures: list[np.ndarray], theme: str) -> list[np.ndarray]:
-    """Pictures of different heights with paper above and below, so that they can stand in a row."""
+def _row(pictures: list[np.ndarray], theme: str) -> np.ndarray:
+    """Pictures side by side; those of less height get paper above and below."""
     tallest = max(len(p) for p in pictures)
     out = []
     for picture in pictures:
@@ -256,7 +255,7 @@ def _level(pictures: list[np.ndarray], theme: str) -> list[np.ndarray]:
         top = (tallest - len(picture)) // 2
         room[top : top + len(picture)] = picture
         out.append(room)
-    return out
+    return np.hstack(out)
 
 
 def _bar(height: int, colour: Callable, top: float, unit: str, theme: str, low: float = 0.0) -> np.ndarray:

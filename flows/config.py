@@ -42,8 +42,8 @@ class Case:
     @property
     def data(self) -> str:
         """The dataset with the file it reads, if it reads one: what tells subjects apart before they are loaded."""
-        path = self.config["dataset"].get("path")
-        return f"{self.dataset} {Path(path).stem}" if path else self.dataset
+        stem = Path(self.config["dataset"].get("path") or "").stem
+        return self.dataset if stem in self.dataset else f"{self.dataset} {stem}"
 
 
 def groups() -> dict[str, list[str]]:

@@ -118,7 +118,7 @@ def _tables(planned: list[Planned], rows, settings: dict) -> list:
         notes = _notes(planned, settings)
         tables.append(build(rows, title=settings["title"], metrics=UNSEEN, notes=notes, **printed, **common))
         tables.append(build(rows, title="Motion of the same results", metrics=MOTION, notes=[], **common))
-    shared = common | {"labels": common["labels"] | {planned[-1].case.method: "all methods"}}
+    shared = common | {"labels": common["labels"] | {planned[-1].case.method: "all methods"}, "baselines": []}
     rig_notes = ["Errors on the training frames that bones and skeleton were fitted to."]
     tables.append(build(lead, title="Bones and skeleton", metrics=RIG, notes=rig_notes, **shared))
     if rows["metric"].isin(TRUTH).any():

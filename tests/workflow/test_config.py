@@ -112,7 +112,7 @@ def test_a_key_that_only_some_methods_have_is_set_in_those():
 def test_a_dataset_on_the_command_line_replaces_the_experiments():
     cases = config.expand(["+experiment=table3", *FILE])
     assert {c.dataset for c in cases} == {"mesh_sequence"}
-    assert [c.method for c in cases][:3] == ["lbs", "fullmm", "partmm"]
+    assert {c.method for c in cases} >= {"lbs", "fullmm", "partmm"}
 
 
 def test_wildcards_are_one_case_a_file(tmp_path):

@@ -77,6 +77,13 @@ def node_lengths(curve: Curve) -> np.ndarray:
     return np.bincount(curve.edges.ravel(), weights=np.repeat(size / 2.0, 2), minlength=len(curve.nodes))
 
 
+def vertex_areas(surface: Surface) -> np.ndarray:
+    """(V,) area round every vertex: a third of its triangles'."""
+    a, b, c = (surface.vertices[surface.faces[:, k]].astype(np.float64) for k in range(3))
+    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    return np.bincount(surface.faces.ravel(), weights=np.repeat(area / 3.0, 3), minlength=len(surface.vertices))
+
+
 def _barycentric(point: np.ndarray, corner: np.ndarray) -> np.ndarray:
     """point: (V, 3) on triangles with corners (V, 3, 3) -> (V, 3); a triangle without area gives its first corner."""
     u, v, w = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0], point - corner[:, 0]

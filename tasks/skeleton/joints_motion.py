@@ -14,7 +14,7 @@ from tasks.errors import InputError
 from tasks.geometry.measure import diagonal
 from tasks.geometry.neighbours import adjacency, mesh_edges
 from tasks.skeleton.articulation import centres
-from tasks.skeleton.curve_weights import Interpolation, node_lengths, node_weights, onto_surface, thin
+from tasks.skeleton.curve_weights import Interpolation, node_lengths, node_weights, onto_surface, thin, vertex_areas
 from tasks.skeleton.inner_bones import Bones, merge_alike, prune, relative_turn, rigid_pieces
 from tasks.skeleton.refit import refit, spread_weights
 from tasks.skeleton.runs import find_runs
@@ -25,6 +25,8 @@ _PULL = 0.003
 _SOFT = 0.03  # of the diagonal: a joint with this residual stays about where the curve puts it
 _FRAMES, _POINTS = 100, 2500  # looked at while bones are pruned; the refit sees more
 _REFIT_FRAMES, _REFIT_POINTS = 300, 6000
+_INFLUENCES = 4  # bones a point follows while they are pruned: more let ghosts hide
+_LEAST = 3  # points that a piece needs to turn as a whole
 _WARM_UP = 3  # rounds of SSDR before pruning
 
 
@@ -51,7 +53,7 @@ class Body:
 class Articulation:
     """Bones and the places where they meet. links: (L, 2) bone numbers; points: (L, 3) their joints; residuals: (L,)
     gap between both bones' idea of the joint, as a share of the diagonal; costs: (L,) for the spanning tree;
-    middles: (B, 3) each bone's centre on the curve."""
+    middles: (B, 3) each bone's centre on the curve; areas: (B,) surface that each bone carries."""
 
     bones: Bones
     links: np.ndarray
@@ -59,6 +61,7 @@ class Articulation:
     residuals: np.ndarray
     costs: np.ndarray
     middles: np.ndarray
+    areas: np.ndarray
 
 
 def joints_by_motion(
@@ -73,7 +76,6 @@ def joints_by_motion(
     rigid_residual: float,
     missed: float,
     angle: float,
-    least: float,
     shortest: float,
     reach: float,
     rounds: int,
@@ -87,22 +89,21 @@ def joints_by_motion(
     max_joints: most joints; topology: ``motion`` takes the spanning tree of least joint gap, which is right for
     articulated bodies; ``curve`` keeps the curve's own tree, which does not tangle under cloth and soft tissue;
     ``auto`` takes the first where its median gap is under ``rigid_residual``; missed: degrees by which a bone's points
-    must miss without it, or it goes; angle: degrees below which two bones that touch are one; least: share of the
-    points below which a piece is no bone to start from; shortest: run of curve below which a bone is dropped (curve
-    topology); reach: how far a joint may lie from where its bones meet on the curve; rounds: rounds of SSDR once the
-    bones are chosen; refits: rounds of refitting; influences: most joints a point may follow. Lengths are shares of
-    the bounding-box diagonal. Raises InputError for settings out of range.
+    must miss without it, or it goes; angle: degrees below which two bones that touch are one; shortest: run of curve
+    below which a bone is dropped (curve topology); reach: how far a joint may lie from where its bones meet on the
+    curve; rounds: rounds of SSDR once the bones are chosen; refits: rounds of refitting; influences: most joints a
+    point may follow. Lengths are shares of the bounding-box diagonal. Raises InputError for settings out of range.
     """
     _check_settings(max_joints, influences, angle, missed)
     size = diagonal(canonical.points)
     chosen = thin(canonical, surface, curve, _POINTS)
     body = Body(surface, curve, onto_surface(_sampled(canonical, chosen), surface), size)
     frames = _spread(train.frames, _FRAMES)
-    bones = _bones(train, canonical, skinning, frames, chosen, influences)
-    bones = few_bones(bones, body, at_most=max_joints, missed=missed, angle=angle, least=least, rounds=rounds)
+    bones = _bones(train, canonical, skinning, frames, chosen)
+    bones = few_bones(bones, body, at_most=max_joints, missed=missed, angle=angle, rounds=rounds)
     found = by_motion(bones, body, reach)
     if topology == "curve" or (topology == "auto" and np.median(_tree_residuals(found)) > rigid_residual):
-        found = by_curve(bones, body, reach, shortest=shortest, angle=angle)
+        found = by_curve(bones, body, reach, shortest=shortest, angle=angle, at_most=max_joints)
     order, parents, joints = _assemble(found, body)
     joints, weights = _fit_skeleton(
         train, canonical, body, parents, joints, found.bones.transforms[:, order], frames, refits, influences, reach
@@ -110,12 +111,10 @@ def joints_by_motion(
     return Skeleton(joint_names(len(joints)), parents, joints.astype(np.float32), weights)
 
 
-def few_bones(
-    bones: Bones, body: Body, *, at_most: int, missed: float, angle: float, least: float, rounds: int
-) -> Bones:
+def few_bones(bones: Bones, body: Body, *, at_most: int, missed: float, angle: float, rounds: int) -> Bones:
     """From the free bones to those that a skeleton needs."""
     label = _pieces(bones, body)
-    bones = rigid_pieces(bones, label, max(4, round(least * len(bones.rest)))).improve(_WARM_UP)
+    bones = rigid_pieces(bones, label, _LEAST).improve(_WARM_UP)
     bones = body.dominant(prune(bones, body.size, angle=missed, at_most=at_most).improve(rounds)).improve(rounds)
     on_curve = body.on_curve(bones.weights)
     shared = on_curve.T @ (on_curve * node_lengths(body.curve)[:, None])
@@ -139,10 +138,12 @@ def by_motion(bones: Bones, body: Body, reach: float) -> Articulation:
     away = np.linalg.norm(points - guess, axis=1)
     common = np.maximum(shared[pairs[:, 0], pairs[:, 1]], 1e-6 * length.mean())
     costs = (residuals / size + 0.3 * away / size + 0.001) / np.sqrt(common)
-    return Articulation(bones, pairs, points, residuals / size, costs, _middles(on_curve * length[:, None], curve))
+    middles = _middles(on_curve * length[:, None], curve)
+    areas = vertex_areas(body.surface) @ body.carry.carry(bones.weights)
+    return Articulation(bones, pairs, points, residuals / size, costs, middles, areas)
 
 
-def by_curve(bones: Bones, body: Body, reach: float, *, shortest: float, angle: float) -> Articulation:
+def by_curve(bones: Bones, body: Body, reach: float, *, shortest: float, angle: float, at_most: int) -> Articulation:
     """The curve's own tree: a bone for every run of nodes that one bone dominates, a joint where two runs meet."""
     curve, size = body.curve, body.size
     edges, length = link_components(curve.nodes, curve.edges), node_lengths(curve)
@@ -154,6 +155,7 @@ def by_curve(bones: Bones, body: Body, reach: float, *, shortest: float, angle: 
         relative_turn(bones.transforms),
         shortest=shortest * size,
         angle=np.radians(angle),
+        at_most=at_most,
     )
     transforms = bones.transforms[:, runs.bone]
     pull = np.full(len(runs.links), _PULL)
@@ -163,7 +165,9 @@ def by_curve(bones: Bones, body: Body, reach: float, *, shortest: float, angle: 
     share = np.zeros((len(curve.nodes), len(runs.bone)))
     share[np.arange(len(share)), runs.of_node] = length + 1e-12
     bones = Bones(bones.rest, bones.paths, bones.weights[:, runs.bone], transforms, bones.influences)
-    return Articulation(bones, runs.links, points, residuals / size, np.ones(len(runs.links)), _middles(share, curve))
+    areas = np.bincount(runs.of_node[curve.of_vertex], vertex_areas(body.surface), minlength=len(runs.bone))
+    costs = np.ones(len(runs.links))
+    return Articulation(bones, runs.links, points, residuals / size, costs, _middles(share, curve), areas)
 
 
 def keep_inside(joints: np.ndarray, surface: Surface, curve: Curve) -> np.ndarray:
@@ -205,13 +209,13 @@ def _fit_skeleton(train, canonical, body, parents, joints, transforms, frames, r
     return joints, weights
 
 
-def _bones(train: Motion, canonical: Canonical, skinning: Skinning, frames, points, influences: int) -> Bones:
+def _bones(train: Motion, canonical: Canonical, skinning: Skinning, frames, points) -> Bones:
     return Bones(
         canonical.points[points].astype(np.float64),
         train.points[frames][:, points],
         skinning.weights[points],
         skinning.transforms[frames].astype(np.float64),
-        influences,
+        _INFLUENCES,
     )
 
 
@@ -250,7 +254,7 @@ def _assemble(found: Articulation, body: Body) -> tuple[np.ndarray, np.ndarray, 
     """Order of the bones (J,), parents (J,) and joints (J, 3). The root is the bone that carries most of the surface:
     the pelvis or the chest, while the one nearest the centroid is often the neck. Its joint lies on the curve, in the
     bone's middle."""
-    root = int(np.argmax(body.carry.carry(found.bones.weights).sum(axis=0)))
+    root = int(np.argmax(found.areas))
     order, parents = kinematic_tree(found.links, found.costs, root, len(found.middles))
     at = _link_of(found.links)
     joints = np.empty((len(order), 3))

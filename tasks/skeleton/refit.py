@@ -13,6 +13,7 @@ _STEPS = 2  # Gauss-Newton steps a round: the next round goes on from there
 _FIRST_STEPS = 5
 _DAMPING = 1e-4
 _STIFFNESS = 0.01
+_HOLD = 0.003  # pull of a joint to where it was found, against the squared turn about it
 
 
 def refit(
@@ -105,7 +106,7 @@ def fit_joints(
     d = world[:, up] - world  # (F, J, 3, 3)
     normal = np.einsum("fjka,fikb->jaib", d, d, optimize=True) * centred[:, None, :, None]
     gradient = np.einsum("fjka,fjk->ja", d, residual)
-    hold = 1e-3 * len(world) * np.maximum(np.diagonal(centred), 1e-6 * n)
+    hold = _HOLD * len(world) * np.maximum(np.diagonal(centred), 1e-6 * n)
     normal = normal.reshape(3 * count, 3 * count)
     normal[np.arange(3 * count), np.arange(3 * count)] += np.repeat(hold, 3)
     gradient += hold[:, None] * (joints - anchor)

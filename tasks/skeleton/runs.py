@@ -32,9 +32,11 @@ def find_runs(
     *,
     shortest: float,
     angle: float,
+    at_most: int,
 ) -> Runs:
     """Every node is labelled by its dominant bone; runs shorter than ``shortest`` or turning less than ``angle``
-    (radians) against a neighbour are absorbed by the neighbour that moves most like them.
+    (radians) against a neighbour are absorbed by the neighbour that moves most like them; where more than ``at_most``
+    are left, the shortest go on being absorbed.
 
     nodes: (M, 3); edges: (E, 2) connected; weights: (M, B); lengths: (M,) length of curve at each node;
     turn: (B, B) angle that two bones turn apart.
@@ -51,7 +53,7 @@ def find_runs(
         size = np.bincount(of_node, weights=lengths, minlength=len(bone))
         apart = turn[bone[links[:, 0]], bone[links[:, 1]]]
         weaker = np.where(size[links[:, 0]] <= size[links[:, 1]], links[:, 0], links[:, 1])
-        short = size[weaker] < shortest
+        short = (size[weaker] < shortest) | (len(bone) > at_most)
         absorb = short | (apart < angle)
         if not absorb.any():
             break

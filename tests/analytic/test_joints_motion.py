@@ -1,0 +1,177 @@
+"""Joints from relative motion, and the kernels under it, against planted joints."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from tasks.errors import InputError
+from tasks.geometry import kinematics
+from tasks.geometry.measure import vertex_rmse
+from tasks.geometry.rotations import from_rotation_vector
+from tasks.geometry.skinning import skin
+from tasks.geometry.sparse_weights import fit_weights
+from tasks.skeleton.articulation import centres
+from tasks.skeleton.inner_bones import Bones, prune
+from tasks.skeleton.joints_motion import joints_by_motion, keep_inside
+from tasks.skeleton.poses import fit_poses
+from tasks.values import Skinning
+from tests.analytic.jointed_shapes import Bending, ball_joint
+from tests.shipped import shipped
+
+SETTINGS = shipped("skeleton.motion")
+POSES = shipped("skeleton.poses")
+
+
+def find(shape: Bending, skinning: Skinning | None = None, **changed):
+    inputs = (shape.motion, shape.canonical, skinning or shape.skinning, shape.surface, shape.curve)
+    return joints_by_motion(*inputs, **(SETTINGS | changed))
+
+
+def lbs_error(shape: Bending, skeleton) -> float:
+    poses = fit_poses(shape.motion, shape.canonical, skeleton, **POSES)
+    transforms = kinematics.forward(skeleton.parents, skeleton.joints, poses.rotations, poses.translations)
+    return vertex_rmse(skin(shape.canonical.points, skeleton.weights, transforms), shape.motion.points)
+
+
+@pytest.mark.parametrize("topology", ["auto", "motion", "curve"])
+def test_a_ball_joint_is_found(topology):
+    shape = ball_joint()
+    skeleton = find(shape, topology=topology)
+    assert len(skeleton.joints) == 2
+    np.testing.assert_allclose(skeleton.joints[1], [1.0, 0.0, 0.0], atol=0.02)
+    assert lbs_error(shape, skeleton) < 2e-3
+
+
+def test_a_hinge_is_found_though_it_is_free_along_its_axis():
+    turns = np.zeros((40, 2, 3))
+    turns[:, 1, 2] = np.linspace(-1.0, 1.0, 40)
+    shape = Bending(2.0, [0.0, 1.0], turns, np.zeros((40, 3)), 0.05)
+    skeleton = find(shape)
+    assert len(skeleton.joints) == 2
+    np.testing.assert_allclose(skeleton.joints[1], [1.0, 0.0, 0.0], atol=0.02)
+
+
+def test_a_chain_of_three_is_a_chain():
+    rng = np.random.default_rng(3)
+    turns = rng.uniform(-0.5, 0.5, (50, 3, 3))
+    shape = Bending(3.0, [0.0, 1.0, 2.0], turns, rng.normal(size=(50, 3)), 0.1)
+    skeleton = find(shape)
+    assert len(skeleton.joints) == 3
+    inner = np.sort(skeleton.joints[1:, 0])
+    root = skeleton.joints[0, 0]
+    expected = {0: [1.0, 2.0], 1: [1.0, 2.0], 2: [1.0, 2.0]}[int(root)]
+    np.testing.assert_allclose(inner, expected, atol=0.03)
+    assert lbs_error(shape, skeleton) < 5e-3
+
+
+def test_ghost_bones_are_seen_through():
+    """Blends of the true bones, given to some of the points, are no bones of their own."""
+    shape = ball_joint()
+    true = shape.transforms
+    half = true.mean(axis=1, keepdims=True)
+    third = (0.3 * true[:, :1] + 0.7 * true[:, 1:]).copy()
+    transforms = np.concatenate([true, half, third], axis=1).astype(np.float32)
+    weights = np.concatenate([shape.weights, np.zeros((len(shape.weights), 2))], axis=1).astype(np.float32)
+    mixed = shape.weights.min(axis=1) > 0.2
+    weights[mixed] = [0.0, 0.0, 0.6, 0.4]
+    ghosts = Skinning(shape.skinning.rest, weights, transforms, np.zeros(1))
+    skeleton = find(shape, ghosts)
+    assert len(skeleton.joints) == 2
+    np.testing.assert_allclose(skeleton.joints[1], [1.0, 0.0, 0.0], atol=0.02)
+
+
+def test_a_body_that_moves_as_one_has_one_joint():
+    rng = np.random.default_rng(4)
+    turns = np.zeros((20, 2, 3))
+    turns[:, 0] = rng.uniform(-1.0, 1.0, (20, 3))
+    shape = Bending(2.0, [0.0, 1.0], turns, rng.normal(size=(20, 3)), 0.05)
+    skeleton = find(shape)
+    assert len(skeleton.joints) == 1
+    assert skeleton.parents.tolist() == [-1]
+    assert lbs_error(shape, skeleton) < 1e-3
+
+
+def test_weights_are_sparse_convex_and_the_ceiling_holds():
+    rng = np.random.default_rng(5)
+    shape = Bending(4.0, [0.0, 1.0, 2.0, 3.0], rng.uniform(-0.5, 0.5, (40, 4, 3)), np.zeros((40, 3)), 0.2)
+    for ceiling in (4, 2):
+        skeleton = find(shape, max_joints=ceiling, influences=2)
+        assert len(skeleton.joints) <= ceiling
+        np.testing.assert_allclose(skeleton.weights.sum(axis=1), 1.0, atol=1e-5)
+        assert skeleton.weights.min() >= 0.0
+        assert (skeleton.weights > 0).sum(axis=1).max() <= 2
+        assert (skeleton.weights.argmax(axis=1)[:, None] == np.arange(len(skeleton.joints))).any(axis=0).all()
+
+
+def test_the_same_input_gives_the_same_bits():
+    first, second = find(ball_joint()), find(ball_joint())
+    assert first.joints.tobytes() == second.joints.tobytes()
+    assert first.weights.tobytes() == second.weights.tobytes()
+
+
+def test_joints_outside_are_taken_inside():
+    shape = ball_joint()
+    moved = keep_inside(np.array([[1.0, 0.5, 0.0], [0.5, 0.01, 0.0]]), shape.surface, shape.curve)
+    assert np.linalg.norm(moved[0, 1:]) < 0.15
+    assert moved[1].tolist() == [0.5, 0.01, 0.0]
+
+
+def test_a_setting_out_of_range_is_named():
+    with pytest.raises(InputError, match=r"skeleton\.motion\.max_joints"):
+        find(ball_joint(), max_joints=0)
+
+
+def test_centres_of_planted_pairs_with_noise_in_the_guess():
+    rng = np.random.default_rng(6)
+    place = rng.normal(size=3)
+    r = from_rotation_vector(rng.uniform(-1, 1, (100, 2, 3)))
+    meet = rng.normal(size=(100, 3))  # both bones carry the place here
+    t = meet[:, None] - (r @ place[:, None])[..., 0]
+    transforms = np.concatenate([r, t[..., None]], axis=-1)
+    guess = (place + np.array([0.05, -0.05, 0.02]))[None]
+    points, residuals = centres(transforms, np.array([[0, 1]]), guess, np.array([1e-3]), 0.2)
+    np.testing.assert_allclose(points[0], place, atol=1e-3)
+    assert residuals[0] < 1e-3
+    clipped, _ = centres(transforms, np.array([[0, 1]]), guess + np.array([0.95, 0.05, -0.02]), np.array([1e-3]), 0.2)
+    assert np.linalg.norm(clipped[0] - place - [1.0, 0, 0]) == pytest.approx(0.2)
+
+
+def test_sparse_weights_match_a_search_over_all_supports():
+    rng = np.random.default_rng(7)
+    rest = rng.normal(size=(12, 3))
+    r = from_rotation_vector(rng.uniform(-0.7, 0.7, (6, 6, 3)))
+    transforms = np.concatenate([r, rng.normal(size=(6, 6, 3, 1))], axis=-1)
+    true = rng.dirichlet(np.ones(6), 12)
+    points = skin(rest, true, transforms)
+    found = fit_weights(rest, points, transforms, influences=2, exchanges=6)
+    each = np.einsum("fbij,nj->nfbi", transforms, np.concatenate([rest, np.ones((12, 1))], 1))  # (N, F, B, 3)
+    for n in range(12):
+        best = np.inf
+        for a, b in combinations(range(6), 2):
+            d = (each[n, :, a] - each[n, :, b]).ravel()
+            w = np.clip(d @ (points[:, n] - each[n, :, b]).ravel() / (d @ d), 0.0, 1.0)
+            mixed = w * each[n, :, a] + (1 - w) * each[n, :, b]
+            best = min(best, np.sum((mixed - points[:, n]) ** 2))
+        reached = np.sum((np.einsum("fbi,b->fi", each[n], found[n]) - points[:, n]) ** 2)
+        assert reached <= 1.3 * best + 1e-9  # an exchange search, not an exhaustive one
+
+
+def test_sparse_weights_are_exact_where_they_can_be():
+    shape = ball_joint()
+    found = fit_weights(shape.canonical.points, shape.motion.points, shape.transforms, influences=2, exchanges=2)
+    np.testing.assert_allclose(found, shape.weights, atol=1e-3)
+
+
+def test_pruning_keeps_small_bones_that_turn_and_drops_large_ones_that_do_not():
+    rng = np.random.default_rng(8)
+    turns = np.zeros((40, 4, 3))
+    turns[:, 1] = rng.uniform(-0.5, 0.5, (40, 3))
+    turns[:, 3] = rng.uniform(-0.5, 0.5, (40, 3))  # the last 5 % of the length; joint 2 in the middle never turns
+    shape = Bending(4.0, [0.0, 1.0, 2.0, 3.8], turns, np.zeros((40, 3)), 0.05)
+    bones = Bones(shape.canonical.points.astype(float), shape.motion.points, shape.weights, shape.transforms, 4)
+    kept = prune(bones, 4.0, angle=4.0, at_most=10)
+    assert kept.count == 3
+    assert kept.error() < 1e-3

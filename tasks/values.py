@@ -216,8 +216,8 @@ class Metrics:
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure. name: its file's stem; caption: one line for readers; png: (bytes,) uint8, the content of a PNG file, or
-    None for a drawing, whose text is svg."""
+    """A figure. name: its file's stem; caption: one line for readers; png: (bytes,) uint8, the content of a PNG file,
+    or None for a drawing, whose text is svg."""
 
     name: str
     caption: str

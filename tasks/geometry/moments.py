@@ -72,16 +72,18 @@ def skin_error(moments: Moments, transforms: np.ndarray) -> np.ndarray:
 def fit_rigid(moments: Moments, transforms: np.ndarray, sweeps: int) -> np.ndarray:
     """Rigid transforms that lower the skinning error, one after the other in closed form, the others held (Le & Deng
     2012, eq. 8-13: weighted Procrustes on the residual). transforms: (F, J, 3, 4) -> (F, J, 3, 4) float64."""
-    t = transforms.astype(np.float64)
+    frames, count = transforms.shape[:2]
+    rows = transforms.astype(np.float64).transpose(0, 2, 1, 3).reshape(3 * frames, 4 * count)
+    k = moments.K.transpose(0, 2, 1, 3).reshape(4 * count, 4 * count)
     for _ in range(sweeps):
-        for j in range(t.shape[1]):
+        for j in range(count):
             weight = moments.K[j, j, 3, 3]
             if weight < 1e-9:  # no point follows this transform: nothing to fit
                 continue
-            others = np.einsum("kab,fkib->fai", moments.K[j], t) - np.einsum("ab,fib->fai", moments.K[j, j], t[:, j])
-            target = moments.Y[:, j] - others  # (F, 4, 3)
+            own = slice(4 * j, 4 * j + 4)
+            others = (rows @ k[:, own] - rows[:, own] @ k[own, own]).reshape(frames, 3, 4)
+            target = np.swapaxes(moments.Y[:, j], -1, -2) - others  # (F, 3, 4) = sum_n w_j (x - the others' part) h^T
             centre = moments.K[j, j, :3, 3] / weight
-            h = target[:, :3] - centre[:, None] * target[:, 3:]
-            r = project_so3(np.swapaxes(h, -1, -2))
-            t[:, j] = rigid.make(r, target[:, 3] / weight - r @ centre)
-    return t
+            r = project_so3(target[..., :3] - target[..., 3:] * centre)
+            rows[:, own] = rigid.make(r, target[..., 3] / weight - r @ centre).reshape(3 * frames, 4)
+    return rows.reshape(frames, 3, count, 4).transpose(0, 2, 1, 3)

@@ -48,7 +48,7 @@ def test_the_bend_of_a_capsule_is_a_joint_between_two_end_effectors():
 
 
 def test_the_root_turns_one_side_only_and_leaves_own_nothing():
-    """The root lies at the bend, both its children are leaves: one rigid piece remains; so it is in the paper's model."""
+    """The root lies at the bend, both its children are leaves: one rigid piece remains, as in the paper."""
     skeleton = find(ball_joint())
     assert (skeleton.weights.sum(axis=0) > 0).tolist() == [True, False, False]
     np.testing.assert_allclose(skeleton.weights.sum(axis=1), 1.0, atol=1e-6)

@@ -6,6 +6,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_limits
 
 from tasks.errors import InputError
 from tasks.geometry import kinematics
@@ -23,6 +24,13 @@ from tests.shipped import shipped
 
 SETTINGS = shipped("skeleton.motion")
 POSES = shipped("skeleton.poses")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _one_thread_in_products():
+    """As stages run in the workflow: spinning BLAS threads make small products crawl."""
+    with threadpool_limits(1, user_api="blas"):
+        yield
 
 
 def find(shape: Bending, skinning: Skinning | None = None, **changed):

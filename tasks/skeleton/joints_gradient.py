@@ -55,7 +55,15 @@ def joints_by_gradient(
     start = np.zeros((len(canonical.points), len(at)), np.float32)
     start[np.arange(len(start)), owner[nearest]] = 1.0
     joints, start = refit(
-        train.points, canonical.points, parents, nodes[at], start, rounds=refits, influences=influences, reach=0.0
+        train.points,
+        canonical.points,
+        parents,
+        nodes[at],
+        start,
+        rounds=refits,
+        influences=influences,
+        reach=0.0,
+        hold=0.0,
     )
     return Skeleton(joint_names(len(at)), parents, joints.astype(np.float32), start)
 

@@ -21,8 +21,13 @@ from tasks.skeleton.runs import find_runs
 from tasks.skeleton.tree import joint_names, kinematic_tree, link_components
 from tasks.values import Canonical, Curve, Motion, Skeleton, Skinning, Surface
 
-_PULL = 0.003
+_PULL = 0.001
+_FOCUS = 4.0  # power of w_a w_b: traces of both far away must not draw their joint from where they meet
 _SOFT = 0.03  # of the diagonal: a joint with this residual stays about where the curve puts it
+_HOLD = {
+    True: 0.003,
+    False: 0.03,
+}  # pull on joints in the refit where the tree is the curve's, and where it is the motion's
 _FRAMES, _POINTS = 100, 2500  # looked at while bones are pruned; the refit sees more
 _REFIT_FRAMES, _REFIT_POINTS = 300, 6000
 _INFLUENCES = 4  # bones a point follows while they are pruned: more let ghosts hide
@@ -102,11 +107,22 @@ def joints_by_motion(
     bones = _bones(train, canonical, skinning, frames, chosen)
     bones = few_bones(bones, body, at_most=max_joints, missed=missed, angle=angle, rounds=rounds)
     found = by_motion(bones, body, reach)
-    if topology == "curve" or (topology == "auto" and np.median(_tree_residuals(found)) > rigid_residual):
+    soft = topology == "curve" or (topology == "auto" and np.median(_tree_residuals(found)) > rigid_residual)
+    if soft:
         found = by_curve(bones, body, reach, shortest=shortest, angle=angle, at_most=max_joints)
     order, parents, joints = _assemble(found, body)
     joints, weights = _fit_skeleton(
-        train, canonical, body, parents, joints, found.bones.transforms[:, order], frames, refits, influences, reach
+        train,
+        canonical,
+        body,
+        parents,
+        joints,
+        found.bones.transforms[:, order],
+        frames,
+        refits,
+        influences,
+        reach,
+        _HOLD[soft],
     )
     return Skeleton(joint_names(len(joints)), parents, joints.astype(np.float32), weights)
 
@@ -132,7 +148,7 @@ def by_motion(bones: Bones, body: Body, reach: float) -> Articulation:
     candidates = shared > 1e-3 * length.mean()
     candidates[meet[:, 0], meet[:, 1]] = candidates[meet[:, 1], meet[:, 0]] = True  # so that the graph is connected
     pairs = np.argwhere(np.triu(candidates, 1))
-    share = on_curve[:, pairs[:, 0]] * on_curve[:, pairs[:, 1]] * length[:, None] + 1e-12
+    share = (on_curve[:, pairs[:, 0]] * on_curve[:, pairs[:, 1]] + 1e-9) ** _FOCUS * length[:, None]
     guess = (share.T @ curve.nodes) / share.sum(axis=0)[:, None]
     points, residuals = centres(bones.transforms, pairs, guess, np.full(len(pairs), _PULL), reach * size)
     away = np.linalg.norm(points - guess, axis=1)
@@ -187,7 +203,7 @@ def keep_inside(joints: np.ndarray, surface: Surface, curve: Curve) -> np.ndarra
     return out
 
 
-def _fit_skeleton(train, canonical, body, parents, joints, transforms, frames, refits, influences, reach):
+def _fit_skeleton(train, canonical, body, parents, joints, transforms, frames, refits, influences, reach, hold):
     """Joints and weights refitted on a part of points and frames, then all points' weights in one go."""
     chosen = thin(canonical, body.surface, body.curve, _REFIT_POINTS)
     rest = canonical.points[chosen].astype(np.float64)
@@ -202,6 +218,7 @@ def _fit_skeleton(train, canonical, body, parents, joints, transforms, frames, r
         rounds=refits,
         influences=influences,
         reach=reach * body.size,
+        hold=hold,
     )
     joints = keep_inside(joints, body.surface, body.curve)
     if len(chosen) < len(canonical.points):

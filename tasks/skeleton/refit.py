@@ -13,7 +13,6 @@ _STEPS = 2  # Gauss-Newton steps a round: the next round goes on from there
 _FIRST_STEPS = 5
 _DAMPING = 1e-4
 _STIFFNESS = 0.01
-_HOLD = 0.003  # pull of a joint to where it was found, against the squared turn about it
 
 
 def refit(
@@ -26,12 +25,13 @@ def refit(
     rounds: int,
     influences: int,
     reach: float,
+    hold: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Alternates poses, weights and joint positions, each of which lowers the skinning error.
 
     points: (F, N, 3); rest: (N, 3); joints: (J, 3); weights: (N, J); reach: how far a joint may move from where it
-    was found (nought: not at all) -> joints (J, 3) float64 and weights (N, J) float32. Joints without a child and
-    without points keep none.
+    was found (nought: not at all); hold: pull to there, against the squared turn about the joint -> joints (J, 3)
+    float64 and weights (N, J) float32. Joints without points keep none.
     """
     origin = rest.mean(axis=0, dtype=np.float64)
     points, rest = points - origin.astype(np.float32), rest - origin
@@ -45,7 +45,7 @@ def refit(
         steps = _STEPS if r else _FIRST_STEPS
         world, root = solve_poses(parents, joints, moments, world, root, steps=steps, damping=_DAMPING)
         if reach > 0:
-            joints, root = fit_joints(parents, joints, moments, world, root, anchor=start, reach=reach)
+            joints, root = fit_joints(parents, joints, moments, world, root, anchor=start, reach=reach, hold=hold)
         transforms = transforms_of(parents, joints, world, root)
         weights = _fit(rest, points, transforms, weights, ~empty, influences)
     return joints + origin, weights
@@ -90,6 +90,7 @@ def fit_joints(
     *,
     anchor: np.ndarray,
     reach: float,
+    hold: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Joint positions of least skinning error for given rotations: linear least squares, the root's shift of every
     frame eliminated. Moving joint j by d moves its subtree by (R_parent - R_j) d. Each joint is drawn weakly to its
@@ -106,10 +107,10 @@ def fit_joints(
     d = world[:, up] - world  # (F, J, 3, 3)
     normal = np.einsum("fjka,fikb->jaib", d, d, optimize=True) * centred[:, None, :, None]
     gradient = np.einsum("fjka,fjk->ja", d, residual)
-    hold = _HOLD * len(world) * np.maximum(np.diagonal(centred), 1e-6 * n)
+    pull = hold * len(world) * np.maximum(np.diagonal(centred), 1e-6 * n)
     normal = normal.reshape(3 * count, 3 * count)
-    normal[np.arange(3 * count), np.arange(3 * count)] += np.repeat(hold, 3)
-    gradient += hold[:, None] * (joints - anchor)
+    normal[np.arange(3 * count), np.arange(3 * count)] += np.repeat(pull, 3)
+    gradient += pull[:, None] * (joints - anchor)
     gradient[parents < 0] = 0.0
     move = -np.linalg.solve(normal, gradient.ravel()).reshape(count, 3)
     move[parents < 0] = 0.0

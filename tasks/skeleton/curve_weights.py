@@ -72,9 +72,11 @@ def node_weights(curve: Curve, on_surface: np.ndarray) -> np.ndarray:
 
 
 def node_lengths(curve: Curve) -> np.ndarray:
-    """(M,) length of curve that belongs to each node: half of every edge at it."""
+    """(M,) length of curve that belongs to each node: half of every edge at it, and never nought (a ball's curve is one
+    point)."""
     size = np.linalg.norm(curve.nodes[curve.edges[:, 0]].astype(np.float64) - curve.nodes[curve.edges[:, 1]], axis=1)
-    return np.bincount(curve.edges.ravel(), weights=np.repeat(size / 2.0, 2), minlength=len(curve.nodes))
+    half = np.bincount(curve.edges.ravel(), weights=np.repeat(size / 2.0, 2), minlength=len(curve.nodes))
+    return np.maximum(half, 1e-12)
 
 
 def vertex_areas(surface: Surface) -> np.ndarray:

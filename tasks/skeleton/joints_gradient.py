@@ -44,6 +44,8 @@ def joints_by_gradient(
     weights = node_weights(curve, onto_surface(canonical, surface).carry(skinning.weights))
     branches = resample(curve.nodes, curve.edges, weights, spacing * size)
     nodes, edges, at = _join(branches, [maxima(transition(b.weights), tau) for b in branches])
+    if len(nodes) == 0:  # the curve of a ball is one point
+        nodes, at = curve.nodes[:1].astype(np.float64), np.zeros(1, np.int64)
     edges = link_components(nodes, edges)
     links, costs = contract(nodes, edges, at)
     centroid = canonical.points.mean(axis=0, dtype=np.float64)
@@ -124,4 +126,4 @@ def _join(branches: list[Branch], peaks: list[np.ndarray]) -> tuple[np.ndarray, 
             points.append(point)
         edges += pairwise(here)
         joints |= {here[s] for s in found}
-    return np.array(points), np.array(edges, np.int64), np.array(sorted(joints), np.int64)
+    return np.array(points), np.array(edges, np.int64).reshape(-1, 2), np.array(sorted(joints), np.int64)

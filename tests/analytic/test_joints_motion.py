@@ -16,9 +16,10 @@ from tasks.geometry.skinning import skin
 from tasks.geometry.sparse_weights import fit_weights
 from tasks.skeleton.articulation import centres
 from tasks.skeleton.inner_bones import Bones, prune
+from tasks.skeleton.joints_gradient import joints_by_gradient
 from tasks.skeleton.joints_motion import joints_by_motion, keep_inside
 from tasks.skeleton.poses import fit_poses
-from tasks.values import Skinning
+from tasks.values import Curve, Skinning
 from tests.analytic.jointed_shapes import Bending, ball_joint
 from tests.shipped import shipped
 
@@ -100,6 +101,19 @@ def test_a_body_that_moves_as_one_has_one_joint():
     assert len(skeleton.joints) == 1
     assert skeleton.parents.tolist() == [-1]
     assert lbs_error(shape, skeleton) < 1e-3
+
+
+@pytest.mark.parametrize("way", [joints_by_motion, joints_by_gradient])
+def test_a_curve_of_one_point_gives_one_joint(way):
+    """A ball shrinks to a point: there is no branch to walk along."""
+    shape = ball_joint()
+    of = np.zeros(len(shape.canonical.points), np.int32)
+    point = Curve(np.array([[1.0, 0.0, 0.0]], np.float32), np.zeros((0, 2), np.int32), of, of)
+    settings = SETTINGS if way is joints_by_motion else shipped("skeleton.gradient")
+    skeleton = way(shape.motion, shape.canonical, shape.skinning, shape.surface, point, **settings)
+    assert len(skeleton.joints) == 1
+    np.testing.assert_allclose(skeleton.joints[0], [1.0, 0.0, 0.0])
+    np.testing.assert_allclose(skeleton.weights, 1.0)
 
 
 def test_weights_are_sparse_convex_and_the_ceiling_holds():

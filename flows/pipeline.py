@@ -72,14 +72,15 @@ def _benchmark(case: Case, name: str, add) -> Planned:
 
 
 def _data(config: dict, add) -> dict[str, Output]:
-    """Stage 1: the motion, its seen and unseen part, the canonical shape."""
+    """Stage 1: the motion and what is odd about it, its seen and unseen part, the canonical shape."""
     data = config["dataset"]
     motion = add("dataset", schema.load_function(data["kind"]), data, "motion")["motion"]
     halves = add("split", schema.SPLIT, config["split"], "train test", motion=motion)
     train, test = halves["train"], halves["test"]
     choice = {"choice": config["skeleton"]["canonical"]}
     canonical = add("canonical", schema.CANONICAL, choice, "canonical", train=train)["canonical"]
-    return {"motion": motion, "train": train, "test": test, "canonical": canonical}
+    about = add("about", schema.ABOUT, {}, "about", motion=motion)["about"]
+    return {"motion": motion, "about": about, "train": train, "test": test, "canonical": canonical}
 
 
 def _rig(config: dict, add) -> dict[str, Output]:

@@ -63,7 +63,8 @@ def write(
 
     settings = planned[0].case.config["report"]
     rows = join([_rows(p, refs, store) for p in planned])
-    tables = _tables(planned, rows, settings)
+    remarks = dict.fromkeys(f"{a.name}: {note}." for a in (_about(p, refs, store) for p in planned) for note in a.notes)
+    tables = _tables(planned, rows, settings, list(remarks))
     figures = [(node.cases[0], store.load(refs[node.id], "picture")) for node in pictures]
     figures += _curve(planned, rows, settings["curve"])
     figures += _charts(rows, {p.case.method: p.case.config["animate"]["label"] for p in planned})
@@ -90,7 +91,7 @@ def _rows(case: Planned, refs: dict[str, Ref], store: Store):
     return join([rows_of(store.load(ref, "metrics"), key=ref.key, **labels) for ref in found])
 
 
-def _tables(planned: list[Planned], rows, settings: dict) -> list:
+def _tables(planned: list[Planned], rows, settings: dict, remarks: list[str]) -> list:
     from tasks.evaluation.paper import paper_of
     from tasks.evaluation.tables import build
 
@@ -119,7 +120,7 @@ def _tables(planned: list[Planned], rows, settings: dict) -> list:
         tables.append(build(rows, title=settings["title"], metrics=UNSEEN, notes=notes, **printed, **common))
         tables.append(build(rows, title="Motion of the same results", metrics=MOTION, notes=[], **common))
     shared = common | {"labels": common["labels"] | {planned[-1].case.method: "all methods"}, "baselines": []}
-    rig_notes = ["Errors on the training frames that bones and skeleton were fitted to."]
+    rig_notes = ["Errors on the training frames that bones and skeleton were fitted to.", *remarks]
     tables.append(build(lead, title="Bones and skeleton", metrics=RIG, notes=rig_notes, **shared))
     if rows["metric"].isin(TRUTH).any():
         tables.append(build(lead, title="Joints against the true rig", metrics=TRUTH, notes=[], **shared))
@@ -209,6 +210,10 @@ def _variant(case: Planned) -> str:
     return "" if case.case.variant == NO_ABLATION else case.case.variant
 
 
+def _about(case: Planned, refs: dict[str, Ref], store: Store):
+    node, output = case.nodes["about"]
+    return store.load(refs[node.id], output)
+
+
 def _subject(case: Planned, refs: dict[str, Ref], store: Store) -> str:
-    node, output = case.nodes["test"]
-    return re.sub(r"\s+", "_", store.load(refs[node.id], output).name)
+    return re.sub(r"\s+", "_", _about(case, refs, store).name)

@@ -17,6 +17,7 @@ from tasks.errors import InputError
 CLUSTER = "tasks.bones.clustering:cluster"
 SSDR = "tasks.bones.ssdr:ssdr"
 RIGID = "tasks.bones.rigid:rigid_skinning"
+ABOUT = "tasks.datasets.validate:about"
 SPLIT = "tasks.datasets.split:split"
 CANONICAL = "tasks.datasets.canonical:canonical"
 SURFACE = "tasks.skeleton.surface:closed_surface"

@@ -215,6 +215,14 @@ class Metrics:
 
 
 @dataclass(frozen=True)
+class About:
+    """A dataset in words. name: the subject's; notes: what is unusual about it, one line each."""
+
+    name: str
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class Picture:
     """A figure. name: its file's stem; caption: one line for readers; png: (bytes,) uint8, the content of a PNG file,
     or None for a drawing, whose text is svg."""
@@ -238,7 +246,7 @@ class Training:
 
 
 _KINDS = (Rig, Motion, Canonical, Clusters, Skinning, Surface, Curve, Skeleton, Poses, Parts, Database, Training)
-VALUES = {kind.__name__: kind for kind in (*_KINDS, Animation, Metrics, Picture)}
+VALUES = {kind.__name__: kind for kind in (*_KINDS, Animation, Metrics, About, Picture)}
 
 
 def same(a: object, b: object) -> bool:

@@ -17,7 +17,7 @@ from tasks.geometry import kinematics
 from tasks.geometry.measure import diagonal
 from tasks.geometry.neighbours import components, mesh_edges
 from tasks.geometry.skinning import skin
-from tasks.values import Motion, Rig
+from tasks.values import About, Motion, Rig
 
 LEAST_POINTS = 4  # three points and a frame of reference: below this no rigid transform is defined
 RIG_NOTED = 1e-3  # of the diagonal
@@ -173,16 +173,9 @@ def number(where: str, array: np.ndarray) -> float:
     return float(array.reshape(-1)[0])
 
 
-def require_frames(motion: Motion, least: int, what: str) -> None:
-    """Raises InputError unless some clip has `least` frames. what: who needs them, such as "a patch"."""
-    longest = int(np.diff(motion.clip_start).max())
-    if longest < least:
-        raise InputError(
-            f"{motion.name}: frames",
-            expected=f"a clip of at least {least} frames, the length of {what}",
-            found=f"the longest of {len(motion.clip_names)} clips has {longest}",
-            do=f"give longer clips or shorten {what}",
-        )
+def about(motion: Motion) -> About:
+    """The data's name and :func:`notes`, for the report."""
+    return About(motion.name, tuple(notes(motion)))
 
 
 def notes(motion: Motion) -> list[str]:

@@ -95,33 +95,6 @@ def error_figure(
     return render.finish(_row([sheet, _bar(len(sheet), error_map, top, unit, theme)], theme))
 
 
-def overlay_figure(
-    test: Motion, results: Mapping[str, np.ndarray], *, focus: str, azimuth: float, theme: str = "light"
-) -> np.ndarray:
-    """The truth as a glass over each method's result, in the median and the worst frame of ``focus``.
-
-    results: label -> (F, N, 3) on the frames of ``test``. Where the two agree, only the colour is mixed.
-    """
-    chosen = _chosen_frames(test, results[focus])
-    cameras = _cameras(test.points[list(chosen.values())], azimuth)
-    shape = shape_of(test.points[0], test.faces)
-    tint = part_colours(2)
-    rows = []
-    for camera, (rank, frame) in zip(cameras, chosen.items(), strict=True):
-        row = []
-        for name, points in results.items():
-
-            def made(canvas: np.ndarray, camera: render.Camera, points: np.ndarray = points[frame]) -> None:
-                shape.paint(canvas, camera, points, tint[1])
-
-            lines = [name, f"{rank} frame: {_place(test, frame)}"]
-            row.append(_panel(shape, camera, test.points[frame], tint[0], lines, theme, made, opacity=0.3, rim=0.4))
-        rows.append(np.hstack(row))
-    names = ["overlay", "result", "truth"]
-    legend = _legend(sum(len(row) for row in rows), names, [None, tint[1], tint[0]], theme)
-    return render.finish(_row([np.vstack(rows), legend], theme))
-
-
 def skeleton_figure(
     canonical: Canonical, skeleton: Skeleton, parts: Parts | None, *, azimuth: float, theme: str = "light"
 ) -> np.ndarray:
@@ -183,13 +156,6 @@ def count_figure(clusters: Clusters, diagonal: float) -> str:
     chosen = int(clusters.transforms.shape[1])
     series = [plot.Series("rigid clusters", clusters.curve_count, 100.0 * clusters.curve_error / diagonal)]
     return plot.lines(series, x="clusters", y="vertex RMSE [% of diagonal]", mark=(chosen, f"chosen: {chosen}"))
-
-
-def history_figure(skinning: Skinning, diagonal: float) -> str:
-    """Vertex RMSE over the iterations of SSDR. -> SVG."""
-    steps = np.arange(1, len(skinning.history) + 1)
-    series = [plot.Series("SSDR", steps, 100.0 * skinning.history / diagonal)]
-    return plot.lines(series, x="iteration", y="vertex RMSE [% of diagonal]")
 
 
 def _cameras(frames: np.ndarray, azimuth: float) -> list[render.Camera]:

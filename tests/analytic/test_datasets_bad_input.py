@@ -9,6 +9,7 @@ import pytest
 
 from tasks.datasets import mesh_sequence, validate
 from tasks.errors import InputError
+from tasks.values import About
 
 FRAMES, POINTS = 5, 8
 CUBE = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.float32)
@@ -233,12 +234,6 @@ def test_faces_that_are_none(tmp_path, line):
     rejects(lambda: load(tmp_path), "0.obj: f")
 
 
-def test_frames_for_a_patch(tmp_path):
-    motion = load(write(tmp_path / "cube.npz", clip_start=[0, 2, 5]))
-    validate.require_frames(motion, 3, "a patch")
-    rejects(lambda: validate.require_frames(motion, 4, "a patch"), "4 frames", "a patch", "longest of 2 clips has 3")
-
-
 def test_odd_meshes_are_accepted_and_noted(tmp_path):
     vertices = np.concatenate([moving_cube(), moving_cube() + 3, moving_cube()[:, :1]], axis=1)
     faces = np.concatenate([FACES, FACES[:-1] + POINTS, [[0, 0, 1]]])
@@ -247,6 +242,7 @@ def test_odd_meshes_are_accepted_and_noted(tmp_path):
         assert any(words in note for note in notes), (words, notes)
     assert any("1 of 17 points lie exactly on another" in note for note in notes)
     assert validate.notes(load(write(tmp_path / "cube.npz"))) == []
+    assert validate.about(load(tmp_path / "odd.npz")) == About("odd", tuple(notes))
 
 
 def test_a_clip_that_does_not_move_is_noted(tmp_path):

@@ -32,7 +32,7 @@ class Progress:
         self.console = Console(quiet=not show, highlight=False)
         self._events: Path | None = None
         self._read = 0
-        self._running: dict[tuple[str, str], float] = {}
+        self._running: dict[tuple[str, str], tuple[float, str]] = {}  # since when, and how far in its own words
         self._lock = threading.Lock()
         self._live = Live(console=self.console, get_renderable=self._now, refresh_per_second=4, transient=True)
 
@@ -85,8 +85,8 @@ class Progress:
         self._poll()
         table = Table.grid(padding=(0, 1))
         with self._lock:
-            for (stage, case), since in self._running.items():
-                table.add_row(Spinner("dots"), stage, case, f"{time.time() - since:.0f} s")
+            for (stage, case), (since, how_far) in self._running.items():
+                table.add_row(Spinner("dots"), stage, case, f"{time.time() - since:.0f} s", how_far)
         return table
 
     def _poll(self) -> None:
@@ -97,5 +97,10 @@ class Progress:
                 return
             for line in lines[self._read :]:
                 event = json.loads(line)
-                self._running[event["stage"], event["case"]] = event["time"]
+                running = event["stage"], event["case"]
+                if event["event"] == "progress":
+                    since = self._running.get(running, (event["time"], ""))[0]
+                    self._running[running] = since, f"{event['fraction']:4.0%} {event['text']}"
+                else:
+                    self._running[running] = event["time"], ""
             self._read = len(lines)

@@ -99,6 +99,7 @@ def schema(config: dict) -> dict[str, object]:
         "evaluate": settings(EVALUATE) | settings(EVALUATE_RIG),
         "report": REPORT,
         "store": {"path": str},
+        "memory": {"max_gb": float | None},
         "runner": {"kind": Literal["threads", "processes"], "workers": int},
         "sweep": {"datasets": list[str] | None, "methods": list[str] | None, "ablations": list[str] | None},
     }

@@ -11,6 +11,7 @@ from typing import Literal
 from tasks.errors import InputError
 
 ROOT = Path(__file__).resolve().parent.parent
+WORKSPACE = "workspace"  # a keyword that is no setting: see tasks.workspace
 _TYPES = {
     "int": int,
     "float": float,
@@ -33,7 +34,7 @@ def signature(function: str) -> tuple[tuple[str, ...], dict[str, object]]:
     module, name = function.split(":")
     for node in _tree(module).body:
         if isinstance(node, ast.FunctionDef) and node.name == name:
-            types = {a.arg: _type(a.annotation) for a in node.args.kwonlyargs}
+            types = {a.arg: _type(a.annotation) for a in node.args.kwonlyargs if a.arg != WORKSPACE}
             return tuple(a.arg for a in node.args.args), types
     raise LookupError(f"{module} has no function {name}")
 

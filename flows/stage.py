@@ -10,15 +10,18 @@ from __future__ import annotations
 import hashlib
 import importlib
 import json
+import shutil
 import threading
 import time
 from dataclasses import asdict, dataclass
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
 
+from flows.source import WORKSPACE
 from flows.store import Ref, Store, canonical_json, explained
 from tasks.values import Training
+from tasks.workspace import Workspace
 
 FORMAT = 1  # raise it when the store's layout changes
 
@@ -41,6 +44,7 @@ class Job:
     case: str
     store: str
     events: str | None = None
+    max_gb: float | None = None
 
 
 def key_of(job: Job) -> str:
@@ -74,7 +78,7 @@ def run(job: Job) -> Ref:
             return found
         tell(job, "computing")
         with Watch() as watch:
-            values = _compute(job, store)
+            values = _compute(job, store, key)
         meta = {
             "function": job.function,
             "settings": job.settings,
@@ -82,13 +86,15 @@ def run(job: Job) -> Ref:
             "seconds": round(watch.seconds, 3),
             "peak_mb": round(watch.peak_mb, 1),
         }
-        return store.put(job.stage, key, values, meta)
+        ref = store.put(job.stage, key, values, meta)
+        shutil.rmtree(store.scratch(job.stage, key), ignore_errors=True)
+        return ref
 
 
-def tell(job: Job, event: str) -> None:
+def tell(job: Job, event: str, **more: object) -> None:
     """One line for whoever watches the run; a line of this size is appended whole."""
     if job.events:
-        line = json.dumps({"event": event, "stage": job.stage, "case": job.case, "time": time.time()})
+        line = json.dumps({"event": event, "stage": job.stage, "case": job.case, "time": time.time(), **more})
         with explained(Path(job.events)), open(job.events, "a", encoding="utf-8") as file:
             file.write(line + "\n")
 
@@ -133,15 +139,24 @@ def one_blas_thread() -> None:
     threadpool_limits(1, user_api="blas")
 
 
-def _compute(job: Job, store: Store) -> dict[str, object]:
+def _compute(job: Job, store: Store, key: str) -> dict[str, object]:
     one_blas_thread()
     module, name = job.function.split(":")
     function = getattr(importlib.import_module(module), name)
     kinds = function.__annotations__  # as text
     inputs = {n: _load(store, value, kinds.get(n, "")) for n, value in job.inputs.items()}
+    if WORKSPACE in kinds:
+        folder = store.scratch(job.stage, key)
+        with explained(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+        inputs[WORKSPACE] = Workspace(folder, partial(_progress, job), job.max_gb)
     result = function(**inputs, **job.settings)
     values = result if isinstance(result, tuple) else (result,)
     return dict(zip(job.outputs, values, strict=True))
+
+
+def _progress(job: Job, text: str, fraction: float) -> None:
+    tell(job, "progress", text=text, fraction=fraction)
 
 
 def _load(store: Store, value: object, kind: str) -> object:

@@ -81,6 +81,10 @@ class Store:
         """Where an artefact lies, whether or not it is there."""
         return self.path / stage / key
 
+    def scratch(self, stage: str, key: str) -> Path:
+        """A folder for what a long stage has so far; whoever holds the artefact's lock owns it."""
+        return self.path / stage / f"{key}.part"
+
     @contextmanager
     def lock(self, stage: str, key: str) -> Iterator[None]:
         """Holds the artefact's lock. It belongs to the process and dies with it, so no crash leaves it behind."""

@@ -1,8 +1,8 @@
 """The typed values that stages hand to each other.
 
-Symbols as in the paper: F frames, N points, B bones, J joints, M curve nodes, C clips. Lengths are in the unit of the
-data (``Motion.unit``), angles in radians, +Y is up. A transform is a (3, 4) matrix [A | t] that acts on *canonical*
-points: x = A v + t. Everything is float32 unless said otherwise; sums that need it are taken in float64.
+Symbols as in the paper: F frames, N points, B bones, J joints, M curve nodes, C clips, I images. Lengths are in the
+unit of the data (``Motion.unit``), angles in radians, +Y is up. A transform is a (3, 4) matrix [A | t] that acts on
+*canonical* points: x = A v + t. Everything is float32 unless said otherwise; sums that need it are taken in float64.
 
 A value holds arrays, strings, numbers, tuples of strings, other values or None, and nothing else: that is what lets
 the store write it without pickle.
@@ -87,6 +87,83 @@ class Motion:
         if rig is not None:
             rig = replace(rig, rotations=rig.rotations[index], translations=rig.translations[index])
         return replace(self, points=self.points[index], clip_start=start, clip_names=tuple(names), rig=rig)
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Images of a moving thing from known cameras; I images of F distinct times.
+
+    images: (I, H, W, 4) uint8, sRGB colour (not multiplied by alpha) and alpha; has_alpha: False where the data brings
+    no alpha (it is 255 everywhere); background: (3,) in 0..1, the colour behind the thing; view: (I, 4, 4) world to
+    camera, OpenCV's axes (x right, y down, z forward); intrinsics: (I, 3, 3) in pixels, centres of pixels at +0.5;
+    camera: (I,) int32 the number of the camera; frame: (I,) int32 in 0..F-1; times: (F,) in 0..1, rising;
+    fps: frames a second; clip_start: (C+1,) int64 and clip_names over the F frames; unit: as in :class:`Motion`;
+    rig: the skeleton and its pose in every frame, where the data has one, with weights (0, J) where no mesh belongs
+    to it.
+    """
+
+    name: str
+    images: np.ndarray
+    has_alpha: bool
+    background: np.ndarray
+    view: np.ndarray
+    intrinsics: np.ndarray
+    camera: np.ndarray
+    frame: np.ndarray
+    times: np.ndarray
+    fps: float
+    clip_start: np.ndarray
+    clip_names: tuple[str, ...]
+    unit: str = "unit"
+    rig: Rig | None = None
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width in pixels."""
+        return self.images.shape[1], self.images.shape[2]
+
+    def take(self, chosen: np.ndarray) -> Capture:
+        """The capture with the chosen images only; frames and times stay as they are."""
+        names = ("images", "view", "intrinsics", "camera", "frame")
+        return replace(self, **{n: getattr(self, n)[chosen] for n in names})
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """Gaussians at rest. means: (N, 3); scales: (N, 1) isotropic or (N, 3), standard deviations in the data's unit;
+    quaternions: (N, 4) w x y z, or None where scales are isotropic; opacities: (N,) in 0..1;
+    sh: (N, (d+1)^2, 3) coefficients of real spherical harmonics of degree d = 0..3, as 3DGS files have them:
+    colour = 0.5 + sum of sh times basis."""
+
+    means: np.ndarray
+    scales: np.ndarray
+    quaternions: np.ndarray | None
+    opacities: np.ndarray
+    sh: np.ndarray
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """Consistent Gaussians in motion: one canonical set and where each of it is in every frame.
+
+    points: (F, N, 3); rotations: (F, N, 4) w x y z against rest, or None; scaling: (F, N) factor on the scales, or
+    None; opacity: (F, N) factor on the opacities, or None; times, fps, clip_start, clip_names, unit, rig: as in
+    :class:`Capture`; history: (S, 3) iteration, loss, PSNR on the training images in dB, along the fit.
+    """
+
+    name: str
+    gaussians: Gaussians
+    points: np.ndarray
+    rotations: np.ndarray | None
+    scaling: np.ndarray | None
+    opacity: np.ndarray | None
+    times: np.ndarray
+    fps: float
+    clip_start: np.ndarray
+    clip_names: tuple[str, ...]
+    unit: str
+    rig: Rig | None
+    history: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -245,8 +322,11 @@ class Training:
     parts: Parts
 
 
+_IMAGES = (Capture, Gaussians, Reconstruction)
 _KINDS = (Rig, Motion, Canonical, Clusters, Skinning, Surface, Curve, Skeleton, Poses, Parts, Database, Training)
-VALUES = {kind.__name__: kind for kind in (*_KINDS, Animation, Metrics, About, Picture)}
+VALUES = {
+    kind.__name__: kind for kind in (*_KINDS, *_IMAGES, Animation, Metrics, About, Picture)
+}
 
 
 def same(a: object, b: object) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from flows.stage import Job, key_of, run
 from flows.store import CorruptArtefact, Store
 from flows.sweep import StageFailed, compute, raise_first, task_runner
 from tasks.errors import InputError
+from tasks.workspace import Workspace
 
 TOY = "tests.workflow.toy"
 
@@ -23,7 +25,11 @@ class World:
     def __init__(self, folder: Path, kind: str = "threads") -> None:
         self.folder = folder
         self.log = str(folder / "log.txt")
-        self.config = {"store": {"path": str(folder / "store")}, "runner": {"kind": kind, "workers": 2}}
+        self.config = {
+            "store": {"path": str(folder / "store")},
+            "runner": {"kind": kind, "workers": 2},
+            "memory": {"max_gb": None},
+        }
         self.store = Store(folder / "store")
 
     def graph(self, *values: float, tail: str | None = None) -> Graph:
@@ -214,6 +220,28 @@ def test_missing_input_of_a_stage_is_a_damaged_artefact(tmp_path):
     settings = {"log": str(tmp_path / "log.txt")}
     with pytest.raises(CorruptArtefact):
         run(job(tmp_path, stage="double", function=f"{TOY}:double", settings=settings, inputs={"source": (ref, "out")}))
+
+
+def test_long_stage_goes_on_from_its_workspace(tmp_path):
+    ref = run(job(tmp_path))
+    inputs = {"source": (ref, "out")}
+    settings = {"log": str(tmp_path / "log.txt"), "die_at": 2}
+    events = str(tmp_path / "events.jsonl")
+    long = job(tmp_path, stage="long", function=f"{TOY}:long", settings=settings, inputs=inputs, events=events)
+    with pytest.raises(ZeroDivisionError):
+        run(long)
+    assert not run(long).cached
+    steps = [line for line in (tmp_path / "log.txt").read_text().splitlines() if line.startswith("step")]
+    assert steps == ["step 0", "step 1", "step 2", "step 3"]
+    told = [json.loads(line) for line in (tmp_path / "events.jsonl").read_text().splitlines()]
+    assert [e["fraction"] for e in told if e["event"] == "progress"] == [0.0, 0.25, 0.5, 0.75]
+    assert not list((tmp_path / "store").rglob("*.part"))
+
+
+def test_memory_cap_is_one_clear_line(tmp_path):
+    with pytest.raises(InputError, match=r"memory.max_gb.*at most 0.001 GB"):
+        Workspace(tmp_path, max_gb=0.001).say("anything", 0.0)
+    Workspace(tmp_path).say("anything", 0.0)
 
 
 def test_short_names():

@@ -10,6 +10,7 @@ import numpy as np
 
 from tasks.errors import InputError
 from tasks.values import Metrics
+from tasks.workspace import Workspace
 
 
 def _log(log: str, line: str) -> None:
@@ -53,3 +54,16 @@ def refuse(source: Metrics, *, path: str, log: str) -> Metrics:
     """A stage that finds its input bad."""
     _log(log, "refuse")
     raise InputError(str(Path(path).name), expected="something good", found="something bad", do="mend it")
+
+
+def long(source: Metrics, *, log: str, die_at: int, workspace: Workspace) -> Metrics:
+    """Four steps, each kept in the workspace; the first time it dies at one of them."""
+    done = workspace.folder / "done.txt"
+    steps = int(done.read_text()) if done.exists() else 0
+    for step in range(steps, 4):
+        if step == die_at and steps == 0:
+            raise ZeroDivisionError("died on the way")
+        _log(log, f"step {step}")
+        workspace.say(f"step {step}", step / 4)
+        done.write_text(str(step + 1))
+    return source

@@ -324,9 +324,7 @@ class Training:
 
 _IMAGES = (Capture, Gaussians, Reconstruction)
 _KINDS = (Rig, Motion, Canonical, Clusters, Skinning, Surface, Curve, Skeleton, Poses, Parts, Database, Training)
-VALUES = {
-    kind.__name__: kind for kind in (*_KINDS, *_IMAGES, Animation, Metrics, About, Picture)
-}
+VALUES = {kind.__name__: kind for kind in (*_KINDS, *_IMAGES, Animation, Metrics, About, Picture)}
 
 
 def same(a: object, b: object) -> bool:

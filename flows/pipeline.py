@@ -117,7 +117,7 @@ def _skeleton(settings: dict, add, train, test, canonical, skinning) -> dict[str
         skeleton = add("skeleton", schema.GIVEN_SKELETON, {}, "skeleton", train=train, canonical=canonical)["skeleton"]
 
         def pose(motion):
-            inputs = {"motion": motion, "canonical": canonical, "skeleton": skeleton}
+            inputs = {"motion": motion, "train": train, "canonical": canonical, "skeleton": skeleton}
             return add("poses", schema.GIVEN_POSES, {}, "poses", **inputs)["poses"]
 
         return {"skeleton": skeleton, "poses": pose(train), "query": pose(test)}

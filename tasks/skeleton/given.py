@@ -3,31 +3,30 @@
 from __future__ import annotations
 
 from tasks.errors import InputError
+from tasks.geometry.rebase import rebased
 from tasks.values import Canonical, Motion, Poses, Rig, Skeleton
 
 
 def given_skeleton(train: Motion, canonical: Canonical) -> Skeleton:
-    """The data's own tree, rest joints and skin weights. Raises InputError where the data brings none, or where the
-    canonical shape is not the rest shape that they are defined on."""
-    rig = _rig(train)
-    if canonical.frame != -1:
-        raise InputError(
-            "skeleton",
-            expected="the data's rest shape as canonical shape",
-            found=f"training frame {canonical.frame}",
-            do="set skeleton.canonical=rest",
-        )
+    """The data's own tree and skin weights, its joints where they are in the canonical shape: at rest, or in the
+    training frame that was chosen. Raises InputError where the data brings no skeleton."""
+    rig = _at(_rig(train), train, canonical)
     return Skeleton(rig.names, rig.parents, rig.joints, rig.weights)
 
 
-def given_poses(motion: Motion, canonical: Canonical, skeleton: Skeleton) -> Poses:
-    """The data's own rotations and translations, frame by frame. Raises InputError where the data brings none or
-    where they belong to another skeleton."""
+def given_poses(motion: Motion, train: Motion, canonical: Canonical, skeleton: Skeleton) -> Poses:
+    """The data's own rotations and translations from the canonical pose on, frame by frame. Raises InputError where
+    the data brings none or where they belong to another skeleton."""
     rig = _rig(motion)
     if rig.names != skeleton.names or rig.rotations.shape[1] != len(skeleton.parents):
         found = f"{len(rig.names)} joints of the data's own"
         raise InputError("poses", expected=f"the skeleton's {len(skeleton.names)} joints", found=found)
+    rig = _at(rig, train, canonical)
     return Poses(rig.rotations, rig.translations, motion.clip_start)
+
+
+def _at(rig: Rig, train: Motion, canonical: Canonical) -> Rig:
+    return rig if canonical.frame < 0 else rebased(rig, _rig(train), canonical.frame)
 
 
 def _rig(motion: Motion) -> Rig:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tasks.errors import InputError
-from tasks.geometry import kinematics
+from tasks.geometry import kinematics, rigid
 from tasks.geometry.measure import diagonal, vertex_rmse
 from tasks.geometry.moments import fit_rigid, skin_error, skin_moments
 from tasks.geometry.rotations import from_rotation_vector, geodesic
@@ -147,10 +147,34 @@ def test_a_given_skeleton_is_passed_on_and_a_missing_one_is_named():
     motion = Motion("given", plain.points, plain.faces, plain.clip_start, plain.clip_names, 24.0, rig=rig)
     skeleton = given_skeleton(motion, shape.canonical)
     assert skeleton.names == names
-    assert given_poses(motion, shape.canonical, skeleton).rotations is rig.rotations
+    assert given_poses(motion, motion, shape.canonical, skeleton).rotations is rig.rotations
     with pytest.raises(InputError, match="none"):
         given_skeleton(plain, shape.canonical)
-    with pytest.raises(InputError, match="rest shape"):
-        given_skeleton(motion, Canonical(shape.canonical.points, None, 3, "frame"))
     with pytest.raises(InputError, match="2 joints"):
-        given_poses(motion, shape.canonical, skeleton_of(ball_joint()))
+        given_poses(motion, motion, shape.canonical, skeleton_of(ball_joint()))
+
+
+def test_a_given_skeleton_may_start_from_a_posed_frame():
+    """Joints lie where they are in that frame, its pose is the identity, and the world's motion is the same."""
+    shape = chain()
+    rng = np.random.default_rng(0)
+    shifts = rng.normal(0, 0.1, (30, 4, 3)).astype(np.float32)
+    names = ("a", "b", "c", "d")
+    rig = Rig(names, shape.parents, shape.joints.astype(np.float32), shape.weights, shape.rotations, shifts)
+    plain = shape.motion
+    motion = Motion("given", plain.points, plain.faces, plain.clip_start, plain.clip_names, 24.0, rig=rig)
+    posed = Canonical(plain.points[7], None, 7, "frame 7")
+    skeleton = given_skeleton(motion, posed)
+    test = motion.take_frames([slice(20, 30)], ["late"])
+    poses = given_poses(test, motion, posed, skeleton)
+    np.testing.assert_allclose(
+        given_poses(motion, motion, posed, skeleton).rotations[7], np.eye(3)[None].repeat(4, 0), atol=1e-6
+    )
+    true = kinematics.forward(rig.parents, rig.joints, rig.rotations, rig.translations)
+    found = kinematics.forward(skeleton.parents, skeleton.joints, poses.rotations, poses.translations)
+    at_rest = rng.normal(size=(5, 3))
+    for j in range(4):
+        there = rigid.apply(true[7, j], at_rest)
+        np.testing.assert_allclose(
+            rigid.apply(found[:, j, None], there), rigid.apply(true[20:, j, None], at_rest), atol=1e-5
+        )

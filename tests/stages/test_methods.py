@@ -44,7 +44,7 @@ def bind(train: Motion, parts: dict, skinning: Skinning | None = None) -> Traini
     """The data's own skeleton; its joints as bones where no other bones are given."""
     shape = canonical(train, choice="rest")
     skeleton = given_skeleton(train, shape)
-    poses = given_poses(train, shape, skeleton)
+    poses = given_poses(train, train, shape, skeleton)
     if skinning is None:
         world = forward(skeleton.parents, skeleton.joints, poses.rotations, poses.translations)
         skinning = Skinning(shape.points, skeleton.weights, world, np.zeros((0, 2)))
@@ -56,7 +56,7 @@ def error(method: str, train: Motion, test: Motion, skinning: Skinning | None = 
     """Vertex RMSE as a part of the diagonal."""
     animate, parts = as_shipped(method)
     training = bind(train, parts, skinning)
-    made = animate(training, given_poses(test, training.canonical, training.skeleton))
+    made = animate(training, given_poses(test, train, training.canonical, training.skeleton))
     return vertex_rmse(made.points, test.points) / diagonal(training.canonical.points)
 
 
@@ -97,7 +97,7 @@ def test_sources_are_training_frames_and_unseen_poses_are_farther(horse):
     train, test = horse
     animate, parts = as_shipped("partmm")
     training = bind(train, parts)
-    far = animate(training, given_poses(test, training.canonical, training.skeleton))
+    far = animate(training, given_poses(test, train, training.canonical, training.skeleton))
     near = animate(training, training.database.poses)
     assert far.sources.min() >= 0
     assert far.sources.max() < train.frames

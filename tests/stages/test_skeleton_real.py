@@ -116,7 +116,7 @@ def test_a_posed_fox_lies_on_its_points_and_its_joints_inside(fox):
 def test_the_foxs_own_poses_come_back_from_its_points_alone(fox):
     """The rig's feet stretch away from their legs, which rotations cannot follow: hence the median."""
     skeleton = given_skeleton(fox.motion, fox.canonical)
-    true = given_poses(fox.motion, fox.canonical, skeleton)
+    true = given_poses(fox.motion, fox.motion, fox.canonical, skeleton)
     transforms = kinematics.forward(skeleton.parents, skeleton.joints, true.rotations, true.translations)
     posed = skin(fox.canonical.points, skeleton.weights, transforms)
     assert vertex_rmse(posed, fox.motion.points) < 1e-5 * diagonal(fox.canonical.points)

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 
 from flows import schema
 from flows.config import NO_ABLATION, Case
+from flows.garments import plan_garment, plan_manifest
 from flows.graph import Graph, Node
 from flows.source import signature
 
@@ -39,6 +40,9 @@ def plan(case: Case, graph: Graph) -> Planned:
         path = settings.get("path") if stage == "dataset" else None
         return graph.add(stage, function, settings, outputs=tuple(outputs.split()), case=name, path=path, **inputs)
 
+    if config["pipeline"] == "make_garments":
+        made = plan_garment(case, name, graph)
+        return Planned(case, name, (made["metrics"][0],), made)
     if config["pipeline"] in schema.BENCHMARKS:
         return _benchmark(case, name, add)
     nodes = _rig(config, add)
@@ -135,9 +139,19 @@ def _skeleton(settings: dict, add, train, test, canonical, skinning) -> dict[str
     return {"surface": surface, "curve": curve, "skeleton": skeleton, "poses": fit(train), "query": fit(test)}
 
 
+def plan_files(planned: list[Planned], graph: Graph) -> list[Output]:
+    """The files that the report brings along."""
+    made = {p.case.config["dataset"]["garment"]: p for p in planned if "garment_file" in p.nodes}
+    if not made:
+        return []
+    every = next(iter(made.values())).case.config["make"]["every"]
+    return plan_manifest({garment: p.nodes for garment, p in made.items()}, every, graph)
+
+
 def plan_pictures(planned: list[Planned], graph: Graph) -> list[Node]:
     """The figures of a report: for every dataset, its last case, and the errors of some methods or variants."""
-    found = [p.nodes["picture"][0] for p in planned if "picture" in p.nodes]
+    drawn = [p.nodes[n] for p in planned for n in ("picture", "frames_picture") if n in p.nodes]
+    found = [node for node, _ in drawn]
     planned = [p for p in planned if "skinning" in p.nodes]  # benchmarks make none
     for data in dict.fromkeys(p.case.data for p in planned):
         cases = [p for p in planned if p.case.data == data]

@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 
 from flows.config import CONF, NO_ABLATION
 from flows.graph import Graph, Node
-from flows.pipeline import Planned
+from flows.pipeline import Output, Planned
 from flows.provenance import provenance
 from flows.store import Ref, Store
 
@@ -42,6 +42,7 @@ BENCHMARKS = {
         },
     ),
 }
+CLOTH = ("deep_pct", "depth_995", "strain_p99_pct", "speed_max", "frames_count")
 TRUTH = ("joint_f1", "joint_f1_fine", "link_f1", "j2j_pct", "j2b_pct", "b2b_pct")
 
 
@@ -55,7 +56,13 @@ class Report:
 
 
 def write(
-    planned: list[Planned], pictures: list[Node], graph: Graph, refs: dict[str, Ref], computed: set[str], store: Store
+    planned: list[Planned],
+    pictures: list[Node],
+    files: list[Output],
+    graph: Graph,
+    refs: dict[str, Ref],
+    computed: set[str],
+    store: Store,
 ) -> Report:
     """Writes a report's folder and returns what to show of it."""
     from tasks.evaluation import report, typeset
@@ -70,7 +77,8 @@ def write(
     figures += _charts(rows, {p.case.method: p.case.config["animate"]["label"] for p in planned})
     folder = Path(settings["path"]).expanduser() / settings["name"]
     origin = provenance([p.case for p in planned], graph, refs, computed)
-    report.write_report(folder, rows, tables, figures, origin)
+    brought = [store.load(refs[node.id], output) for node, output in files]
+    report.write_report(folder, rows, tables, figures, origin, brought)
     markdown = "\n".join(typeset.markdown(t) for t in tables)
     return Report(folder, markdown, [typeset.terminal(t) for t in tables])
 
@@ -111,6 +119,8 @@ def _tables(planned: list[Planned], rows, settings: dict, remarks: list[str]) ->
         },
         "baselines": settings["baselines"],
     }
+    if planned[0].case.config["pipeline"] == "make_garments":
+        return _garment_tables(rows, settings, remarks, common)
     if planned[0].case.config["pipeline"] in BENCHMARKS:
         return _benchmark_tables(planned, rows, settings, common)
     tables = []
@@ -125,6 +135,19 @@ def _tables(planned: list[Planned], rows, settings: dict, remarks: list[str]) ->
     if rows["metric"].isin(TRUTH).any():
         tables.append(build(lead, title="Joints against the true rig", metrics=TRUTH, notes=[], **shared))
     return tables
+
+
+def _garment_tables(rows, settings: dict, remarks: list[str], common: dict) -> list:
+    """The cloth's quality as a whole, then clip by clip."""
+    from tasks.evaluation.tables import build, unranked
+
+    common |= {"data_status": {}, "stands_for": {}, "baselines": []}
+    notes = [*remarks, *([settings["note"]] if settings["note"] else [])]
+    clips = rows[rows["metric"].str.contains("@")]
+    split = clips["metric"].str.split("@", n=1)
+    clips = clips.assign(method=split.str[1], metric=split.str[0])
+    shown = [(settings["title"], rows, (*CLOTH, "points_count"), notes), ("Clip by clip", clips, CLOTH, [])]
+    return [unranked(build(r, title=title, metrics=m, notes=n, **common)) for title, r, m, n in shown]
 
 
 def _benchmark_tables(planned: list[Planned], rows, settings: dict, common: dict) -> list:

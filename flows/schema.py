@@ -38,6 +38,21 @@ BENCHMARKS = {
     "benchmark_skeleton": "tasks.benchmarks.skeleton:benchmark_skeleton",
     "scale_bones": "tasks.benchmarks.scale:scale_bones",
 }
+GARMENTS = {
+    "body": "tasks.garments.body:anny_body",
+    "cutting": "tasks.garments.pattern:cutting_pose",
+    "cut": "tasks.garments.pattern:cut",
+    "dressing": "tasks.garments.retarget:dressing",
+    "clip": "tasks.garments.retarget:motion_clip",
+    "simulate": "tasks.garments.simulate:simulate_frames",
+    "pack_body": "tasks.garments.pack:pack_body",
+    "pack": "tasks.garments.pack:pack_garment",
+    "check": "tasks.garments.manifest:check_garment",
+    "manifest": "tasks.garments.manifest:manifest",
+    "picture": "tasks.evaluation.pictures:garment_picture",
+}
+PER_CLIP = ("clip", "cycles", "turn", "slow")  # settings of a motion that differ from clip to clip
+PER_RUN = ("fps", "frames")  # settings of garments that several stages share
 
 REPORT = {
     "name": str,
@@ -85,7 +100,7 @@ def schema(config: dict) -> dict[str, object]:
     bones |= settings(SSDR if config["bones"].get("kind") != "clusters" else RIGID)
     return {
         "seed": int,
-        "pipeline": Literal["animate", "rig", "benchmark_bones", "benchmark_skeleton", "scale_bones"],
+        "pipeline": Literal["animate", "rig", "benchmark_bones", "benchmark_skeleton", "scale_bones", "make_garments"],
         "dataset": {
             "kind": str,
             "status": Literal["paper", "substitute"],
@@ -108,12 +123,32 @@ def schema(config: dict) -> dict[str, object]:
 def _method(config: dict) -> dict[str, object]:
     """What a file of the group ``method`` sets: a method of ours, or a peer to be measured against."""
     labels = {"name": str, "label": str}
+    if config["pipeline"] == "make_garments":
+        return {"animate": labels, "make": _make(config["make"])}
     benchmark = BENCHMARKS.get(str(config["pipeline"]))
     if benchmark:
         own = {n: t for n, t in settings(benchmark).items() if n not in OF_STAGES}
         return {"animate": labels, "benchmark": own}
     function = animate_function(config["animate"].get("function", ""))
     return {"animate": labels | {"function": str, **settings(function)}, "parts": settings(PARTS)}
+
+
+def _make(make: dict) -> dict[str, object]:
+    """The group ``make`` of the pipeline make_garments; garments and clips are whatever it names."""
+    of = {name: settings(function) for name, function in GARMENTS.items()}
+    return {
+        "only": list[str],
+        "frames": of["clip"]["frames"],
+        "fps": of["clip"]["fps"],
+        "every": of["check"]["every"],
+        "step": of["pack"]["step"],
+        "body": of["body"],
+        "cut": dict.fromkeys(make["cut"], of["cut"]),
+        "dressing": of["dressing"],
+        "motion": {n: t for n, t in of["clip"].items() if n not in (*PER_CLIP, *PER_RUN)},
+        "clips": {name: {n: of["clip"][n] for n in PER_CLIP} for name in make["clips"]},
+        "simulate": {n: t for n, t in of["simulate"].items() if n not in PER_RUN},
+    }
 
 
 def settings(function: str, *, rename: dict[str, str] | None = None) -> dict[str, object]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from flows.config import Case
 from flows.graph import Graph, Node, short
-from flows.pipeline import Planned, plan, plan_pictures
+from flows.pipeline import Output, Planned, plan, plan_files, plan_pictures
 from flows.progress import Progress
 from flows.server import server
 from flows.stage import Job, run
@@ -47,11 +47,12 @@ def run_sweep(cases: list[Case], show: bool = True) -> Path:
         graph = Graph()
         planned = [plan(case, graph) for case in cases]
         pictures = plan_pictures(planned, graph) if config["report"]["figures"] else []
+        files = plan_files(planned, graph)
         ready()
-        return Path(_flow(config, graph, planned, pictures, show)(config["report"]["name"], len(cases)))
+        return Path(_flow(config, graph, planned, pictures, files, show)(config["report"]["name"], len(cases)))
 
 
-def _flow(config: dict, graph: Graph, planned: list[Planned], pictures: list[Node], show: bool):
+def _flow(config: dict, graph: Graph, planned: list[Planned], pictures: list[Node], files: list[Output], show: bool):
     """The flow of a sweep; its parameters are what the run's page shows."""
     from prefect import flow
 
@@ -61,7 +62,7 @@ def _flow(config: dict, graph: Graph, planned: list[Planned], pictures: list[Nod
 
         bar = ProgressArtifact(experiment, len(graph.nodes))
         with Progress(graph, show, bar.update) as progress:
-            report, computed = _computed_report(config, graph, planned, pictures, progress)
+            report, computed = _computed_report(config, graph, planned, pictures, files, progress)
         publish(report.folder, report.tables)
         progress.finish(report.shown, report.folder, computed)
         return str(report.folder)
@@ -70,7 +71,12 @@ def _flow(config: dict, graph: Graph, planned: list[Planned], pictures: list[Nod
 
 
 def _computed_report(
-    config: dict, graph: Graph, planned: list[Planned], pictures: list[Node], progress: Progress
+    config: dict,
+    graph: Graph,
+    planned: list[Planned],
+    pictures: list[Node],
+    files: list[Output],
+    progress: Progress,
 ) -> tuple[Report, int]:
     """The report and how many stages were computed for it."""
     from flows.reporting import write
@@ -82,7 +88,7 @@ def _computed_report(
         computed |= outcome.computed
         raise_first(graph, outcome)
         try:
-            return write(planned, pictures, graph, outcome.refs, computed, store), len(computed)
+            return write(planned, pictures, files, graph, outcome.refs, computed, store), len(computed)
         except CorruptArtefact as error:
             if attempt == ATTEMPTS:
                 raise

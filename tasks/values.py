@@ -311,6 +311,22 @@ class Picture:
 
 
 @dataclass(frozen=True)
+class Cloth:
+    """The state of simulated cloth between two frames. points: (N, 3) metres; velocities: (N, 3) metres a second."""
+
+    points: np.ndarray
+    velocities: np.ndarray
+
+
+@dataclass(frozen=True)
+class File:
+    """A file that a report brings along. path: where it lies in the report's folder; content: (bytes,) uint8."""
+
+    path: str
+    content: np.ndarray
+
+
+@dataclass(frozen=True)
 class Training:
     """All that a method may learn from: nothing of the test clips is in here."""
 
@@ -324,7 +340,7 @@ class Training:
 
 _IMAGES = (Capture, Gaussians, Reconstruction)
 _KINDS = (Rig, Motion, Canonical, Clusters, Skinning, Surface, Curve, Skeleton, Poses, Parts, Database, Training)
-VALUES = {kind.__name__: kind for kind in (*_KINDS, *_IMAGES, Animation, Metrics, About, Picture)}
+VALUES = {kind.__name__: kind for kind in (*_KINDS, *_IMAGES, Animation, Metrics, About, Picture, Cloth, File)}
 
 
 def same(a: object, b: object) -> bool:

@@ -17,6 +17,7 @@ from tasks.values import Canonical, Clusters, Motion, Parts, Skeleton, Skinning
 
 PICTURE = 330  # side of a square picture in a figure, in pixels; others have its area
 ELEVATION = 0.18
+WORN_FROM = 0.5  # azimuth of pictures of clothes, in radians off the front
 EYE = 5.0  # the eye's distance in bounding radii
 CAPTION = 30  # height of a line of text under a picture
 
@@ -156,6 +157,32 @@ def count_figure(clusters: Clusters, diagonal: float) -> str:
     chosen = int(clusters.transforms.shape[1])
     series = [plot.Series("rigid clusters", clusters.curve_count, 100.0 * clusters.curve_error / diagonal)]
     return plot.lines(series, x="clusters", y="vertex RMSE [% of diagonal]", mark=(chosen, f"chosen: {chosen}"))
+
+
+def worn_figure(
+    panels: Mapping[str, tuple[np.ndarray, np.ndarray]], skin: np.ndarray, cloth: np.ndarray, *, theme: str = "light"
+) -> np.ndarray:
+    """Cloth on a body, one picture a frame, from its front. panels: caption -> points of the body, of the cloth;
+    skin, cloth: their faces."""
+    first = next(iter(panels.values()))[0]
+    shape = Shape(np.concatenate([skin, cloth + len(first)]), 0.0)
+    pictures = []
+    for caption, (body, worn) in panels.items():
+        points = np.concatenate([body, worn])
+        colours = np.repeat([CLAY, part_colours(1)[0]], [len(body), len(worn)], axis=0)
+        camera = _cameras(points[None], WORN_FROM)[0]
+        pictures.append(_panel(shape, camera, points, colours, [caption], theme))
+    tallest, widest = (max(p.shape[axis] for p in pictures) for axis in (0, 1))
+    return render.finish(_grid([_on_paper(p, tallest, widest, theme) for p in pictures], 4, theme))
+
+
+def _on_paper(picture: np.ndarray, height: int, width: int, theme: str) -> np.ndarray:
+    """A picture in the middle of a larger sheet, both in canvas pixels."""
+    sheet = np.empty((height, width, 3), np.uint8)
+    sheet[:] = render.to_bytes(render.PAPER[theme])
+    top, left = (height - picture.shape[0]) // 2, (width - picture.shape[1]) // 2
+    sheet[top : top + picture.shape[0], left : left + picture.shape[1]] = picture
+    return sheet
 
 
 def _cameras(frames: np.ndarray, azimuth: float) -> list[render.Camera]:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from tasks.evaluation import figures, render
-from tasks.geometry import measure
-from tasks.values import Animation, Canonical, Clusters, Motion, Parts, Picture, Skeleton, Skinning
+from tasks.geometry import kinematics, measure
+from tasks.geometry.skinning import skin
+from tasks.values import Animation, Canonical, Clusters, Motion, Parts, Picture, Poses, Skeleton, Skinning
 
 
 def error_picture(test: Motion, canonical: Canonical, animations: dict[str, Animation], *, focus: str) -> Picture:
@@ -40,6 +41,19 @@ def count_picture(train: Motion, canonical: Canonical, clusters: Clusters) -> Pi
     """Error against the number of clusters, with the chosen number."""
     drawing = figures.count_figure(clusters, measure.diagonal(canonical.points))
     return Picture("count", f"{train.name}: error of rigid clusters against their number", None, drawing)
+
+
+def garment_picture(body: Motion, poses: dict[str, Poses], cloth: dict[str, Motion], *, clips: list[str]) -> Picture:
+    """The cloth on the body in the middle of every clip. poses: of the body, whose last clip is the cloth's frames."""
+    rig, panels = body.rig, {}
+    for clip in clips:
+        frame = cloth[clip].frames // 2
+        at = slice(int(poses[clip].clip_start[-2]) + frame, int(poses[clip].clip_start[-2]) + frame + 1)
+        turned = kinematics.forward(rig.parents, rig.joints, poses[clip].rotations[at], poses[clip].translations[at])
+        panels[f"{clip}, frame {frame}"] = (skin(body.rest, rig.weights, turned)[0], cloth[clip].points[frame])
+    first = cloth[clips[0]]
+    pixels = figures.worn_figure(panels, body.faces, first.faces)
+    return Picture("frames", f"{first.name}: the middle frame of every clip", _png(pixels))
 
 
 def _png(pixels: np.ndarray) -> np.ndarray:

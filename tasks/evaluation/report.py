@@ -23,7 +23,7 @@ from tasks.errors import InputError
 from tasks.evaluation import page, typeset
 from tasks.evaluation.rows import to_csv
 from tasks.evaluation.tables import Table
-from tasks.values import Picture
+from tasks.values import File, Picture
 
 PROVENANCE = "provenance.json"
 _STAGING = ".new-"
@@ -35,13 +35,16 @@ def write_report(
     tables: Sequence[Table],
     figures: Sequence[tuple[str, Picture]],
     provenance: Mapping[str, Any],
+    brought: Sequence[File] = (),
 ) -> None:
     """Writes a report, over an earlier one if there is any; files that only the earlier one had are removed.
 
     rows: as in metrics.csv; figures: (subject, picture), drawn into figures/<subject>_<name>; provenance: plain JSON
-    values, to which "files" is added, each file's sha256. Raises InputError where the folder cannot be written.
+    values, to which "files" is added, each file's sha256; brought: files that stages made.
+    Raises InputError where the folder cannot be written.
     """
     files = contents(f"Skelebones: {folder.name}", rows, tables, figures, provenance)
+    files |= {file.path: file.content.tobytes() for file in brought}
     sums = {name: hashlib.sha256(data).hexdigest() for name, data in files.items()}
     text = json.dumps({**provenance, "files": sums}, indent=2, allow_nan=False) + "\n"
     try:
@@ -90,13 +93,13 @@ def _replace(folder: Path, files: Mapping[str, bytes]) -> None:
     try:
         for name, data in files.items():
             path = staging / name
-            path.parent.mkdir(exist_ok=True)
+            path.parent.mkdir(parents=True, exist_ok=True)
             with path.open("wb") as out:
                 out.write(data)
                 out.flush()
                 os.fsync(out.fileno())
         for name in files:
-            (folder / name).parent.mkdir(exist_ok=True)
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
             os.replace(staging / name, folder / name)
         for name in earlier - set(files):
             (folder / name).unlink(missing_ok=True)

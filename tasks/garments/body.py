@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+
 import numpy as np
 
+from tasks.errors import InputError
 from tasks.geometry.neighbours import components, mesh_edges
 from tasks.values import Motion, Rig
 
 PREFIX = "mixamorig:"
+EXTRA = ("anny", "newton", "warp", "pybullet_data")  # modules of the extra `garments`
 DIGITS = ("Thumb", "Index", "Middle", "Ring", "Pinky")  # these follow their hand
 
 
@@ -15,8 +19,9 @@ def anny_body(*, gender: float, age: float, muscle: float, weight: float, height
     """The body as a motion of one frame, its rest pose, with the `mixamo` rig, fingers merged into hands: 22 joints.
 
     The settings are Anny's phenotypes, each 0..1. Only the skin is kept (no eyes, teeth or tongue). The first start of
-    Anny takes minutes and leaves a cache of some 800 MB.
+    Anny takes minutes and leaves a cache of some 800 MB. Raises InputError without the extra `garments`.
     """
+    check_extra()
     import anny
     import torch
 
@@ -46,6 +51,18 @@ def anny_body(*, gender: float, age: float, muscle: float, weight: float, height
         translations=np.zeros((1, len(names), 3), np.float32),
     )
     return Motion("anny", vertices[None], faces, np.array([0, 1]), ("rest",), 30.0, "m", vertices, rig)
+
+
+def check_extra() -> None:
+    """Raises InputError, before anything is begun, where the extra `garments` is not installed."""
+    missing = [module for module in EXTRA if find_spec(module) is None]
+    if missing:
+        raise InputError(
+            "make_garments",
+            expected="the extra `garments`, which simulates cloth",
+            found=f"no module {', '.join(missing)}",
+            do="python -m pip install -c constraints.txt -e '.[garments]'",
+        )
 
 
 def merge_digits(names: list[str], parents: list[int], heads: np.ndarray, weights: np.ndarray):

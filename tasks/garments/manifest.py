@@ -1,43 +1,69 @@
-"""The manifest of the shipped dataset: every number recomputed from the very files that are shipped."""
+"""What is stated of the dataset: every number recomputed from the very files that are given out."""
 
 from __future__ import annotations
 
 import hashlib
+import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from tasks.datasets import garments
+from tasks.evaluation.metrics import declared
 from tasks.garments.check import quality
-from tasks.values import Poses
+from tasks.values import About, File, Metrics, Poses
+from tasks.workspace import Workspace
 
-GARMENTS = ("tshirt", "dress")
-FILES = ("body.npz", *(f"{name}.npz" for name in GARMENTS))
+# what is asked of the dataset: share of vertices more than 2 mm inside the body, strain, metres a second
+DEEP, STRAIN, FASTEST = 0.005, 0.15, 25.0
 
 
-def describe(folder: Path, *, every: int) -> dict:
-    """Files with size and sha256, and per garment its size, storage error and quality, clip by clip.
+def check_garment(body: File, garment: File, *, every: int, workspace: Workspace) -> tuple[Metrics, File, About]:
+    """Reads the packed files again and measures them: numbers for the report, the garment's part of the manifest, and
+    which of the goals are missed, in words.
 
     every: depth inside the body is measured at each `every`-th frame of a clip, strain and speed at all.
     """
-    return {"files": {name: file_facts(folder / name) for name in FILES}} | {
-        "garments": {name: garment_facts(folder, name, every=every) for name in GARMENTS}
+    for file in (body, garment):
+        (workspace.folder / Path(file.path).name).write_bytes(file.content.tobytes())
+    name = Path(garment.path).stem
+    facts = garment_facts(workspace.folder, name, every=every, say=workspace.say)
+    numbers = _numbers(facts, "") | {"frames_count": facts["frames"], "points_count": facts["vertices"]}
+    for clip, own in facts["clips"].items():
+        numbers |= _numbers(own, f"@{clip}") | {f"frames_count@{clip}": own["frames"]}
+    text = json.dumps(facts, indent=1).encode()
+    facts_file = File(f"{name}.json", np.frombuffer(text, np.uint8))
+    return declared(numbers, "m"), facts_file, About(name, tuple(_missed(facts)))
+
+
+def manifest(files: dict[str, File], facts: dict[str, File], *, every: int) -> File:
+    """``manifest.json``: size and sha256 of the files, and what :func:`check_garment` found."""
+    stated = {
+        "depth_measured_at_every": every,
+        "files": {Path(files[n].path).name: facts_of(files[n].content.tobytes()) for n in sorted(files)},
+        "garments": {name: json.loads(facts[name].content.tobytes()) for name in sorted(facts)},
     }
+    folder = Path(next(iter(files.values())).path).parent
+    text = json.dumps(stated, indent=1) + "\n"
+    return File(str(folder / "manifest.json"), np.frombuffer(text.encode(), np.uint8))
 
 
-def file_facts(path: Path) -> dict:
+def facts_of(data: bytes) -> dict:
     """Bytes and sha256 of a file."""
-    data = path.read_bytes()
     return {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
 
 
-def garment_facts(folder: Path, name: str, *, every: int) -> dict:
+def garment_facts(
+    folder: Path, name: str, *, every: int, say: Callable[[str, float], None] = lambda text, fraction: None
+) -> dict:
     """Sizes, the storage's largest error and the numbers of tasks.garments.check for all frames and for each clip."""
     motion = garments.load(garment=name, path=str(folder), weights="nearest")
     body, poses = garments.read_body(folder / "body.npz"), garments.read_poses(folder / f"{name}.npz")
     step = float(np.load(folder / f"{name}.npz", allow_pickle=False)["step"])
     clips, measured = {}, []
     for clip, frames in zip(motion.clip_names, motion.clips(), strict=True):
+        say(f"clip {clip}", frames.start / motion.frames)
         at = Poses(poses.rotations[frames], poses.translations[frames], np.array([0, frames.stop - frames.start]))
         found = quality(body, at, motion.points[frames], motion.rest, motion.faces, fps=motion.fps, every=every)
         measured.append(found)
@@ -51,7 +77,9 @@ def garment_facts(folder: Path, name: str, *, every: int) -> dict:
         "fps": motion.fps,
         "storage_error_mm": round(500 * step, 4),
         "deep_share": round(float((depth > 0.002).mean()), 6),
+        "depth_995_mm": round(float(1000 * np.percentile(depth, 99.5)), 6),
         "strain_abs_p99": round(float(np.percentile(strain, 99)), 4),
+        "speed_max": max(own["speed_max"] for own in clips.values()),
         "clips": clips,
     }
 
@@ -59,3 +87,26 @@ def garment_facts(folder: Path, name: str, *, every: int) -> dict:
 def rounded(numbers: dict[str, float]) -> dict[str, float]:
     """Six digits are enough to read and to compare."""
     return {name: round(value, 6) for name, value in numbers.items()}
+
+
+def _numbers(facts: dict, ending: str) -> dict[str, float]:
+    """A garment's or a clip's facts by the names of the metrics."""
+    found = {
+        "deep_pct": 100 * facts["deep_share"],
+        "depth_995": facts["depth_995_mm"] / 1000,
+        "strain_p99_pct": 100 * facts["strain_abs_p99"],
+        "speed_max": facts["speed_max"],
+    }
+    return {name + ending: value for name, value in found.items()}
+
+
+def _missed(facts: dict) -> list[str]:
+    found = []
+    if facts["deep_share"] >= DEEP:
+        found.append(f"{100 * facts['deep_share']:.2g} % of the vertices are more than 2 mm inside the body")
+    if facts["strain_abs_p99"] >= STRAIN:
+        found.append(f"1 % of the edges are strained by more than {100 * facts['strain_abs_p99']:.3g} %")
+    for clip, own in facts["clips"].items():
+        if own["speed_max"] >= FASTEST:
+            found.append(f"clip {clip} explodes: a vertex moves at {own['speed_max']:.3g} m/s")
+    return found

@@ -2,14 +2,48 @@
 
 from __future__ import annotations
 
+import io
+
 import numpy as np
 
 from tasks.geometry.kinematics import forward, joint_positions
 from tasks.geometry.quantise import encode
 from tasks.geometry.rotations import to_rotation_vector
-from tasks.values import Canonical, Motion, Poses
+from tasks.values import Canonical, File, Motion, Poses
 
+FOLDER = "garments"  # in a report
 INFLUENCES = 5  # that Anny's vertices have at most
+
+
+def pack_body(body: Motion, cutting: Poses) -> File:
+    """``body.npz``; cutting: the pose in which garments are cut."""
+    return _npz("body", body_arrays(body, cutting))
+
+
+def pack_garment(
+    body: Motion,
+    garment: Canonical,
+    poses: dict[str, Poses],
+    cloth: dict[str, Motion],
+    *,
+    step: float,
+    clips: list[str],
+) -> File:
+    """``<garment>.npz`` of the named clips, in that order. poses: of the body, whose last clip is the cloth's frames;
+    step: see :func:`garment_arrays`."""
+    shown = []
+    for clip in clips:
+        last = slice(int(poses[clip].clip_start[-2]), None)
+        at = Poses(poses[clip].rotations[last], poses[clip].translations[last], cloth[clip].clip_start)
+        shown.append((clip, at, cloth[clip].points))
+    fps = cloth[clips[0]].fps
+    return _npz(garment.source.split()[0], garment_arrays(body, garment, shown, step=step, fps=fps))
+
+
+def _npz(name: str, arrays: dict[str, np.ndarray]) -> File:
+    stream = io.BytesIO()
+    np.savez_compressed(stream, **arrays)
+    return File(f"{FOLDER}/{name}.npz", np.frombuffer(stream.getvalue(), np.uint8))
 
 
 def body_arrays(body: Motion, cutting: Poses) -> dict[str, np.ndarray]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from tasks.errors import InputError
@@ -48,10 +50,16 @@ def motion_clip(
     spread: float,
     stand: float,
     speed: float,
+    frames: int | None,
 ) -> Poses:
     """A motion of the body from pybullet's wheel, lead-in and clip: :func:`tasks.garments.capture.read`, then
-    :func:`retarget`, then :func:`lead_in` from standing with arms `stand` degrees off the body."""
+    :func:`retarget`, then :func:`lead_in` from standing with arms `stand` degrees off the body. frames: of the clip,
+    at most, from its first on, or None for all."""
     capture = read(clip=clip, cycles=cycles, fps=fps, turn=turn, slow=slow)
+    if frames is not None:
+        if frames < 2:
+            raise InputError("make.frames", expected="at least 2 frames, or null for all", found=str(frames))
+        capture = replace(capture, local=capture.local[:frames], root=capture.root[:frames])
     return lead_in(body, retarget(body, capture, spread=spread), spread=stand, fps=fps, speed=speed)
 
 
@@ -127,9 +135,9 @@ def lead_in(body: Motion, poses: Poses, *, spread: float, fps: float, speed: flo
     )
 
 
-def dressing(body: Motion, *, spread: float, frames: int, hold: int, start: Poses) -> Poses:
-    """From a pose (its first frame) to standing in `frames` frames, then `hold` frames of standing still: where a
-    garment settles before any clip."""
+def dressing(body: Motion, start: Poses, *, spread: float, frames: int, hold: int) -> Poses:
+    """From the pose `start` (its first frame) to standing in `frames` frames, then `hold` frames of standing still:
+    where a garment settles before any clip."""
     rig = _checked(body)
     stand = _local_of(rig.parents, zero_pose(body, spread=spread))
     ease = np.concatenate([np.linspace(0, 1, frames), np.ones(hold)])

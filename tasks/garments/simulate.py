@@ -6,25 +6,20 @@ drags the cloth along. Cloth does not collide with itself, nor with hands, nor w
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
-from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
+from tasks.errors import InputError
 from tasks.geometry import kinematics
 from tasks.geometry.skinning import skin
-from tasks.values import Canonical, Motion, Poses
+from tasks.values import Canonical, Cloth, Motion, Poses
+from tasks.workspace import Workspace
 
 WITHOUT = ("LeftHand", "RightHand")  # fingers are finer than the cloth's mesh
 FAR = 100.0  # metres: the moving body stays within, so bounds need no update
-
-
-@dataclass(frozen=True)
-class Cloth:
-    """The state between two frames. points: (N, 3) metres; velocities: (N, 3) metres a second."""
-
-    points: np.ndarray
-    velocities: np.ndarray
 
 
 def collision_faces(body: Motion) -> np.ndarray:
@@ -67,7 +62,7 @@ def simulate(
     rest, at frame `first` itself (which is then given back as it is).
     density: kg/m^2; stretch: N/m, membrane stiffness; bend: N m/rad, of an edge; damping: of stretching, seconds;
     contact: N/m, stiffness of contact; friction: Coulomb's coefficient; thickness: metres that cloth keeps off the
-    skin; drag: 1/s, share of its velocity that still air takes from the cloth.
+    skin; drag: 1/s, share of its velocity that still air takes from the cloth. Raises InputError where cloth explodes.
     """
     if cloth is None:
         cloth = Cloth(garment.points, np.zeros_like(garment.points))
@@ -96,18 +91,17 @@ def simulate(
             before = now
         cloth = scene.get()
         if not np.isfinite(cloth.points).all():
-            raise FloatingPointError(f"the cloth exploded at frame {frame}")
+            found = f"cloth that exploded at frame {frame}"
+            raise InputError("make.simulate", expected="cloth that stays finite", found=found, do="more substeps")
         yield cloth
 
 
-def simulate_chunk(
+def simulate_frames(
     body: Motion,
     garment: Canonical,
     poses: Poses,
-    cloth: Cloth | None,
+    settled: Cloth | None = None,
     *,
-    first: int,
-    count: int,
     fps: float,
     substeps: int,
     iterations: int,
@@ -119,20 +113,50 @@ def simulate_chunk(
     friction: float,
     thickness: float,
     drag: float,
+    workspace: Workspace,
 ) -> tuple[Motion, Cloth]:
-    """`count` frames from `first` on as a motion of the cloth, and the state after the last, for a cached stage.
+    """The cloth over all frames of the poses: the frames of their last clip as a motion, and the state after the last.
 
-    cloth: the state at frame first - 1, or None: the garment as cut; settings as in :func:`simulate`.
+    settled: the cloth on the standing body, with which the first frame begins, or None: the garment as cut. Settings as
+    in :func:`simulate`. Every frame is kept in the workspace as it is done, so that a killed run goes on from there.
     """
     settings = {"density": density, "stretch": stretch, "bend": bend, "damping": damping, "contact": contact}
-    settings |= {"friction": friction, "thickness": thickness, "drag": drag}
-    stepping = simulate(
-        body, garment, poses, cloth, first=first, fps=fps, substeps=substeps, iterations=iterations, **settings
-    )
-    done = [cloth for _, cloth in zip(range(count), stepping, strict=False)]
-    points = np.stack([state.points for state in done])
+    settings |= {"friction": friction, "thickness": thickness, "drag": drag, "fps": fps}
+    settings |= {"substeps": substeps, "iterations": iterations}
+    count = len(poses.rotations)
+    states = _kept(workspace.folder, count)
+    if settled is not None and not states:
+        states = [carried(settled, body, poses)]
+        _keep(workspace.folder, 0, states[0])
+    if len(states) < count:
+        last = states[-1] if states else None
+        for state in simulate(body, garment, poses, last, first=len(states), **settings):
+            _keep(workspace.folder, len(states), state)
+            states.append(state)
+            workspace.say(f"frame {len(states)} of {count}", len(states) / count)
+    shown = states[int(poses.clip_start[-2]) :]
+    points = np.stack([state.points for state in shown])
     name = garment.source.split()[0]
-    return Motion(name, points, garment.faces, np.array([0, len(points)]), (name,), fps, "m", garment.points), done[-1]
+    motion = Motion(name, points, garment.faces, np.array([0, len(points)]), (name,), fps, "m", garment.points)
+    return motion, states[-1]
+
+
+def _keep(folder: Path, frame: int, state: Cloth) -> None:
+    """One file a frame, renamed into place whole."""
+    draft = folder / "draft.npy"
+    np.save(draft, np.stack([state.points, state.velocities]), allow_pickle=False)
+    os.replace(draft, folder / f"{frame:05d}.npy")
+
+
+def _kept(folder: Path, count: int) -> list[Cloth]:
+    """The states of the frames that an earlier run has done, from the first on."""
+    states = []
+    for frame in range(count):
+        file = folder / f"{frame:05d}.npy"
+        if not file.is_file():
+            break
+        states.append(Cloth(*np.load(file, allow_pickle=False)))
+    return states
 
 
 def carried(cloth: Cloth, body: Motion, poses: Poses) -> Cloth:
@@ -185,8 +209,10 @@ class _Scene:
         friction: float,
         thickness: float,
     ) -> None:
-        import newton
         import warp as wp
+
+        wp.config.quiet = True  # before anything starts it: it tells of every kernel it loads
+        import newton
 
         self.wp = wp
         builder = newton.ModelBuilder(up_axis=newton.Axis.Y, gravity=(0.0, -9.81, 0.0))

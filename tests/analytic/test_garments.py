@@ -10,12 +10,12 @@ import trimesh
 
 from tasks.errors import InputError
 from tasks.garments import capture, check, pack, pattern, retarget
-from tasks.garments.simulate import Cloth, carried
+from tasks.garments.simulate import carried
 from tasks.geometry import kinematics
 from tasks.geometry.quantise import decode, encode
 from tasks.geometry.rotations import from_rotation_vector, geodesic
 from tasks.geometry.weight_transfer import nearest_weights, robust_weights
-from tasks.values import Canonical, Motion, Poses, Rig
+from tasks.values import Canonical, Cloth, Motion, Poses, Rig
 
 UP, AHEAD, LEFT = np.eye(3)[[1, 2, 0]]
 LIMBS = ("Shoulder", "Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot", "ToeBase")

@@ -34,7 +34,7 @@ def motions() -> dict:
 
 def test_files_are_the_ones_described(stated):
     for name, facts in stated["files"].items():
-        assert manifest.file_facts(FOLDER / name) == facts
+        assert manifest.facts_of((FOLDER / name).read_bytes()) == facts
     assert sum(facts["bytes"] for facts in stated["files"].values()) < 20e6
 
 

@@ -5,40 +5,67 @@ What needs the extra `garments` is skipped without it; Anny is never started her
 
 from __future__ import annotations
 
-import inspect
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
-import yaml
 
+from flows import config
+from flows.graph import Graph
+from flows.pipeline import plan, plan_files, plan_pictures
 from tasks.datasets import garments
-from tasks.garments import body, check, pack, pattern, retarget, simulate
+from tasks.errors import InputError
+from tasks.garments import body, check, manifest, pack, pattern, retarget, simulate
 from tasks.geometry.neighbours import mesh_edges
-from tasks.values import Canonical, Motion, Poses, Rig
+from tasks.values import Canonical, Cloth, Motion, Poses, Rig
+from tasks.workspace import Workspace
 
 FOLDER = Path(garments.REPOSITORY) / "data" / "garments"
-RECIPE = yaml.safe_load((FOLDER / "recipe.yaml").read_text())
+CASES = config.expand(["+experiment=make_garments"])
+RECIPE = CASES[0].config["make"]
+MOTION = RECIPE["motion"] | {"fps": RECIPE["fps"], "frames": None}
+PHYSICS = RECIPE["simulate"] | {"fps": RECIPE["fps"]}
+
+
+def planned(*overrides: str) -> tuple[Graph, list]:
+    graph = Graph()
+    return graph, [plan(case, graph) for case in config.expand(["+experiment=make_garments", *overrides])]
+
+
+def test_two_garments_share_body_and_motions_and_are_one_simulation_a_clip():
+    graph, cases = planned("make.only=[walk,kick]")
+    files, pictures = plan_files(cases, graph), plan_pictures(cases, graph)
+    stages = [node.stage for node in graph.nodes.values()]
+    counts = {stage: stages.count(stage) for stage in dict.fromkeys(stages)}
+    assert counts == {
+        **{"body": 1, "cutting": 1, "motion": 3, "pattern": 2},
+        **{"simulate": 6, "pack": 3, "check": 2, "figures": 2, "manifest": 1},
+    }
+    assert len(files) == 4
+    assert len(pictures) == 2
+    walk = next(n for n in graph.nodes.values() if n.stage == "motion" and n.settings.get("clip") == "walk")
+    assert walk.settings == MOTION | RECIPE["clips"]["walk"]
 
 
 @pytest.mark.parametrize(
-    ("function", "settings"),
+    ("override", "words"),
     [
-        (body.anny_body, RECIPE["body"]),
-        *((pattern.cut, settings) for settings in RECIPE["cut"].values()),
-        (retarget.dressing, RECIPE["dressing"] | {"start": None}),
-        *((retarget.motion_clip, RECIPE["motion"] | settings) for settings in RECIPE["clips"].values()),
-        (simulate.simulate, RECIPE["simulate"] | {"first": 0}),
-        (pack.garment_arrays, RECIPE["pack"]),
+        ("make.only=[wlak]", ["make.only", "walk, run", "wlak"]),
+        ("dataset=creature_animal", ["garments_tshirt or garments_dress", "creature"]),
     ],
 )
-def test_recipe_is_the_keywords_of_its_functions(function, settings):
-    keywords = [p for p in inspect.signature(function).parameters.values() if p.kind is p.KEYWORD_ONLY]
-    assert set(settings) == {p.name for p in keywords}
-    for keyword in keywords:
-        if keyword.annotation in ("int", "float", "str"):
-            assert type(settings[keyword.name]).__name__ == keyword.annotation, keyword.name
+def test_what_cannot_be_made_is_one_line(override, words):
+    with pytest.raises(InputError) as caught:
+        planned(override)
+    assert all(word in str(caught.value) for word in words), caught.value
+
+
+def test_without_the_extra_it_says_how_to_install_it(monkeypatch):
+    monkeypatch.setattr(body, "find_spec", lambda name: None if name == "newton" else object())
+    with pytest.raises(InputError, match=r"found no module newton; python -m pip install .*\[garments\]"):
+        body.anny_body(**RECIPE["body"])
 
 
 def test_shipped_clips_are_the_recipes():
@@ -72,12 +99,12 @@ def test_clips_are_motions_of_a_body(name):
     """Feet stay near the ground on average, nothing jumps, and the lead-in starts from standing."""
     pytest.importorskip("pybullet_data")
     wearer = garments.read_body(FOLDER / "body.npz")
-    poses = retarget.motion_clip(wearer, **RECIPE["motion"] | RECIPE["clips"][name])
+    poses = retarget.motion_clip(wearer, **MOTION | RECIPE["clips"][name])
     few = Poses(poses.rotations[::5], poses.translations[::5], poses.clip_start)
     lowest = simulate.body_points(wearer, few)[..., 1].min(1)
     assert abs(np.median(lowest)) < 0.12
     assert poses.clip_start[1] >= 15
-    step = np.abs(np.diff(poses.translations[:, 0], axis=0)).max() * RECIPE["motion"]["fps"]
+    step = np.abs(np.diff(poses.translations[:, 0], axis=0)).max() * RECIPE["fps"]
     assert step < 6
 
 
@@ -96,19 +123,29 @@ def ball() -> Motion:
     )
 
 
-@pytest.mark.slow
-def test_cloth_lies_on_a_moving_ball(ball):
-    pytest.importorskip("newton")
+def sliding(frames: int, clip_start: list[int]) -> Poses:
+    """The ball moves along x at 0.3 m/s."""
+    shift = np.zeros((frames, 3, 3), np.float32)
+    shift[:, 0, 0] = 0.01 * np.arange(frames)
+    return Poses(np.tile(np.eye(3, dtype=np.float32), (frames, 3, 1, 1)), shift, np.array(clip_start))
+
+
+@pytest.fixture
+def sheet() -> Canonical:
     x, z = np.meshgrid(np.linspace(-0.25, 0.25, 21), np.linspace(-0.25, 0.25, 21), indexing="ij")
     points = np.stack([x, np.full_like(x, 0.31), z], -1).reshape(-1, 3).astype(np.float32)
     corner = (np.arange(20)[:, None] * 21 + np.arange(20)).ravel()
     faces = (corner[:, None, None] + np.array([[0, 1, 22], [0, 22, 21]])).reshape(-1, 3).astype(np.int32)
-    cloth = Canonical(points, faces, -1, "sheet")
-    frames = 16
-    shift = np.zeros((frames, 3, 3), np.float32)
-    shift[:, 0, 0] = 0.01 * np.arange(frames)  # 0.3 m/s
-    poses = Poses(np.tile(np.eye(3, dtype=np.float32), (frames, 3, 1, 1)), shift, np.array([0, frames]))
-    settings = RECIPE["simulate"] | {"substeps": 12}
+    return Canonical(points, faces, -1, "sheet cut from nothing")
+
+
+@pytest.mark.slow
+def test_cloth_lies_on_a_moving_ball(ball, sheet, tmp_path):
+    pytest.importorskip("newton")
+    cloth = sheet
+    points, faces = sheet.points, sheet.faces
+    frames, poses = 16, sliding(16, [0, 16])
+    settings = PHYSICS | {"substeps": 12}
     states = list(simulate.simulate(ball, cloth, poses, None, first=0, **settings))
     assert len(states) == frames
     np.testing.assert_array_equal(states[0].points, points)
@@ -120,6 +157,77 @@ def test_cloth_lies_on_a_moving_ball(ball):
     assert 0.29 < centre[-1, 1] < 0.32  # it lies on top
     assert centre[-1, 0] > 0.05  # friction takes it along, half of the way at least
     assert moved[-1, :, 1].min() < 0.25  # and its corners hang
-    chunk, last = simulate.simulate_chunk(ball, cloth, poses, states[7], first=8, count=8, **settings)
+    for frame in range(8):
+        simulate._keep(tmp_path, frame, states[frame])
+    resumed, last = simulate.simulate_frames(ball, cloth, poses, **settings, workspace=Workspace(tmp_path))
     np.testing.assert_allclose(last.points, states[-1].points, atol=1e-5)  # stopped and gone on: the same cloth
-    assert chunk.frames == 8
+    assert resumed.frames == frames
+
+
+class Killed(Exception):
+    """Stands in for kill -9."""
+
+
+@pytest.mark.parametrize("settled", [True, False])
+def test_a_killed_simulation_goes_on_frame_by_frame(ball, sheet, tmp_path, monkeypatch, settled):
+    poses = sliding(12, [0, 4, 12])
+    done = []
+
+    def falling(body, garment, poses, cloth, *, first, **settings):
+        if cloth is None:
+            cloth, first = Cloth(garment.points, np.zeros_like(garment.points)), 1
+            yield cloth
+        for frame in range(first, len(poses.rotations)):
+            done.append(frame)
+            cloth = Cloth(cloth.points - np.float32(0.01), cloth.velocities)
+            yield cloth
+
+    def tell(text, fraction):
+        if done[-1:] == [7] and len(done) == 7:
+            raise Killed
+
+    monkeypatch.setattr(simulate, "simulate", falling)
+    state = Cloth(sheet.points, np.zeros_like(sheet.points)) if settled else None
+    workspace = Workspace(tmp_path, tell)
+    with pytest.raises(Killed):
+        simulate.simulate_frames(ball, sheet, poses, state, **PHYSICS, workspace=workspace)
+    (tmp_path / "draft.npy").write_bytes(b"cut short")
+    cloth, last = simulate.simulate_frames(ball, sheet, poses, state, **PHYSICS, workspace=workspace)
+    assert done == list(range(1, 12))  # no frame twice
+    assert cloth.frames == 8  # the lead-in is no data
+    np.testing.assert_allclose(last.points, sheet.points - 0.11, atol=1e-5)
+    np.testing.assert_array_equal(cloth.points[-1], last.points)
+
+
+def test_packed_files_are_measured_and_described(ball, sheet, tmp_path, monkeypatch):
+    """From simulated clips to files that the loader reads, with numbers that say what is wrong with them."""
+    names = ("Hips", "LeftHand", "RightHand")
+    assert ball.rig.names == names
+    poses = {name: sliding(6, [0, 2, 6]) for name in ("a", "b")}
+    shift = poses["a"].translations[2:, 0]
+    points = sheet.points + shift[:, None]
+    cloth = {
+        n: Motion("tshirt", points.copy(), sheet.faces, np.array([0, 4]), (n,), 30.0, "m", sheet.points) for n in poses
+    }
+    cloth["b"].points[-1, 7] += 2.0  # a vertex that flies off
+    still = Poses(poses["a"].rotations[:1], poses["a"].translations[:1], np.array([0, 1]))
+    garment = Canonical(sheet.points, sheet.faces, -1, "tshirt cut from ball")
+    packed = pack.pack_garment(ball, garment, poses, cloth, step=2e-4, clips=["b", "a"])
+    wearer = pack.pack_body(ball, still)
+    metrics, facts, about = manifest.check_garment(wearer, packed, every=1, workspace=Workspace(tmp_path))
+    numbers = dict(zip(metrics.names, metrics.values, strict=True))
+    assert numbers["frames_count"] == 8
+    assert numbers["deep_pct"] == 0
+    assert numbers["speed_max@b"] == pytest.approx(1000 * 30 * 2 * np.sqrt(3), rel=0.02)
+    assert numbers["speed_max@a"] == pytest.approx(300, rel=0.05)
+    assert about.notes[0].startswith("clip b explodes")
+    (tmp_path / "sub").mkdir()
+    for file in (wearer, packed):
+        (tmp_path / "sub" / Path(file.path).name).write_bytes(file.content.tobytes())
+    read = garments.load(garment="tshirt", path=str(tmp_path / "sub"), weights="nearest")
+    assert read.clip_names == ("b", "a")
+    assert np.abs(read.points - np.concatenate([cloth["b"].points, points])).max() < 1.1e-4
+    stated = manifest.manifest({"body": wearer, "tshirt": packed}, {"tshirt": facts}, every=1)
+    text = json.loads(stated.content.tobytes())
+    assert text["files"]["tshirt.npz"] == manifest.facts_of(packed.content.tobytes())
+    assert text["garments"]["tshirt"]["clips"].keys() == {"a", "b"}

@@ -8,15 +8,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from flows import schema
+from flows import intake, schema
 from flows.config import NO_ABLATION, Case
 from flows.garments import plan_garment, plan_manifest
 from flows.graph import Graph, Node
+from flows.intake import Output
 from flows.source import signature
 
 PANELS = 4  # methods or variants side by side in the picture of errors
-
-Output = tuple[Node, str]  # a node and one of its outputs
 
 
 @dataclass(frozen=True)
@@ -30,8 +29,8 @@ class Planned:
 
 
 def plan(case: Case, graph: Graph) -> Planned:
-    """Adds a case's stages to the graph; ``pipeline: rig`` ends with the skeleton, ``animate`` with unseen poses,
-    a benchmark measures a stage against a peer."""
+    """Adds a case's stages to the graph; ``pipeline: reconstruct`` ends with rendered views, ``rig`` with the skeleton,
+    ``animate`` with unseen poses; a benchmark measures a stage against a peer."""
     config = case.config
     name = f"{case.data} {case.method}" + (f" {case.variant}" if case.variant != NO_ABLATION else "")
 
@@ -45,6 +44,9 @@ def plan(case: Case, graph: Graph) -> Planned:
         return Planned(case, name, (made["metrics"][0],), made)
     if config["pipeline"] in schema.BENCHMARKS:
         return _benchmark(case, name, add)
+    if config["pipeline"] == "reconstruct":
+        nodes, measured = intake.reconstruct(config, add)
+        return Planned(case, name, tuple(measured), nodes)
     nodes = _rig(config, add)
     shared = {n: nodes[n] for n in ("train", "canonical", "skinning", "skeleton", "poses")}
     metrics = [add("evaluate", schema.EVALUATE_RIG, config["evaluate"], "metrics", **shared)]
@@ -52,13 +54,14 @@ def plan(case: Case, graph: Graph) -> Planned:
         nodes |= _animation(config, add, nodes)
         unseen = {n: nodes[n] for n in ("animation", "test", "canonical")}
         metrics.append(add("evaluate", schema.EVALUATE, config["evaluate"], "metrics", **unseen))
+        metrics += intake.unseen_views(config, add, nodes)
     return Planned(case, name, tuple(metrics), nodes)
 
 
 def _benchmark(case: Case, name: str, add) -> Planned:
     """A stage of ours, timed in one stage of its own, beside a peer where there is one."""
     config, function = case.config, schema.BENCHMARKS[case.config["pipeline"]]
-    nodes = _data(config, add)
+    nodes = intake.data(config, add)
     if config["pipeline"] != "benchmark_skeleton":
         stages = {"clustering": schema.CLUSTER, "decomposition": schema.SSDR}
         own = {n: schema.arguments(f, config["bones"], config["seed"]) for n, f in stages.items()}
@@ -75,25 +78,13 @@ def _benchmark(case: Case, name: str, add) -> Planned:
     return Planned(case, name, (measured,), nodes | drawn)
 
 
-def _data(config: dict, add) -> dict[str, Output]:
-    """Stage 1: the motion and what is odd about it, its seen and unseen part, the canonical shape."""
-    data = config["dataset"]
-    motion = add("dataset", schema.load_function(data["kind"]), data, "motion")["motion"]
-    halves = add("split", schema.SPLIT, config["split"], "train test", motion=motion)
-    train, test = halves["train"], halves["test"]
-    choice = {"choice": config["skeleton"]["canonical"]}
-    canonical = add("canonical", schema.CANONICAL, choice, "canonical", train=train)["canonical"]
-    about = add("about", schema.ABOUT, {}, "about", motion=motion)["about"]
-    return {"motion": motion, "about": about, "train": train, "test": test, "canonical": canonical}
-
-
 def _rig(config: dict, add) -> dict[str, Output]:
     """Stages 1 to 3: data, bones, skeleton, parts."""
-    data = _data(config, add)
+    data = intake.data(config, add)
     train, test, canonical = data["train"], data["test"], data["canonical"]
     bones = config["bones"]
     clusters = add("clusters", schema.CLUSTER, bones, "clusters", train=train, canonical=canonical)["clusters"]
-    decompose = schema.SSDR if bones["kind"] == "ssdr" else schema.RIGID
+    decompose = schema.BONES[bones["kind"]]
     fitted = add("bones", decompose, bones, "skinning", train=train, canonical=canonical, clusters=clusters)
     skinning = fitted["skinning"]
 

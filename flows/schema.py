@@ -17,6 +17,8 @@ from tasks.errors import InputError
 CLUSTER = "tasks.bones.clustering:cluster"
 SSDR = "tasks.bones.ssdr:ssdr"
 RIGID = "tasks.bones.rigid:rigid_skinning"
+GAUSSIAN_BONES = "tasks.bones.gaussian:gaussian_bones"
+BONES = {"ssdr": SSDR, "clusters": RIGID, "gaussian": GAUSSIAN_BONES}
 ABOUT = "tasks.datasets.validate:about"
 SPLIT = "tasks.datasets.split:split"
 CANONICAL = "tasks.datasets.canonical:canonical"
@@ -31,6 +33,14 @@ GIVEN_POSES = "tasks.skeleton.given:given_poses"
 POSES = "tasks.skeleton.poses:fit_poses"
 DATABASE = "tasks.motion.database:build_database"
 PARTS = "tasks.motion.parts:find_parts"
+SCENE = "tasks.captures.scenes:render_scene"
+FIT = "tasks.reconstruction.fit:fit"
+TRAJECTORIES = "tasks.reconstruction.motion:motion_of"
+ANCHORED = "tasks.reconstruction.anchors:anchored"
+POSE_GAUSSIANS = "tasks.reconstruction.views:pose_gaussians"
+RENDER = "tasks.reconstruction.views:render_views"
+EVALUATE_VIEWS = "tasks.evaluation.images:evaluate_views"
+EVALUATE_PATHS = "tasks.evaluation.paths:evaluate_paths"
 EVALUATE = "tasks.evaluation.metrics:evaluate"
 EVALUATE_RIG = "tasks.evaluation.rig:evaluate_rig"
 BENCHMARKS = {
@@ -54,6 +64,8 @@ GARMENTS = {
 PER_CLIP = ("clip", "cycles", "turn", "slow")  # settings of a motion that differ from clip to clip
 PER_RUN = ("fps", "frames")  # settings of garments that several stages share
 
+PIPELINES = ("animate", "rig", "reconstruct", "make_garments", *BENCHMARKS)
+
 REPORT = {
     "name": str,
     "title": str,
@@ -70,13 +82,18 @@ RENAMED = {"lambda_": "lambda"}  # Python keywords that are the field's names in
 
 
 def load_function(kind: str) -> str:
-    """The loader of a kind of dataset: ``tasks/datasets/<kind>.py``."""
-    return choices("datasets", "load", "dataset.kind", kind)
+    """The loader of a kind of dataset: ``tasks/datasets/<kind>.py``, or of images ``tasks/captures/<kind>.py``."""
+    return choices(("datasets", "captures"), "load", "dataset.kind", kind)
+
+
+def is_capture(kind: str) -> bool:
+    """Whether a kind of dataset holds images rather than moving meshes."""
+    return load_function(kind).startswith("tasks.captures.")
 
 
 def animate_function(function: str) -> str:
     """The method's function: ``tasks/methods/<function>.py``."""
-    return choices("methods", "animate", "animate.function", function)
+    return choices(("methods",), "animate", "animate.function", function)
 
 
 def schema(config: dict) -> dict[str, object]:
@@ -94,19 +111,20 @@ def schema(config: dict) -> dict[str, object]:
             "poses": settings(POSES),
             **{name: settings(function) for name, function in JOINTS.items()},
         }
-    bones = {"kind": Literal["ssdr", "clusters"], **settings(CLUSTER)}
+    bones = {"kind": Literal["ssdr", "clusters", "gaussian"], **settings(CLUSTER)}
     if pipeline in ("benchmark_bones", "scale_bones"):
         bones["kind"] = Literal["ssdr"]
-    bones |= settings(SSDR if config["bones"].get("kind") != "clusters" else RIGID)
+    bones |= settings(BONES.get(config["bones"].get("kind"), SSDR))
     return {
         "seed": int,
-        "pipeline": Literal["animate", "rig", "benchmark_bones", "benchmark_skeleton", "scale_bones", "make_garments"],
+        "pipeline": Literal[PIPELINES],
         "dataset": {
             "kind": str,
             "status": Literal["paper", "substitute"],
             "stands_for": str | None,
             **settings(load_function(dataset.get("kind", ""))),
         },
+        **_images(config),
         "split": settings(SPLIT),
         "bones": bones,
         "skeleton": skeleton | settings(CANONICAL, rename={"choice": "canonical"}),
@@ -120,6 +138,18 @@ def schema(config: dict) -> dict[str, object]:
     }
 
 
+def _images(config: dict) -> dict[str, object]:
+    """The fit of Gaussians, and where there is one, what is rendered for it and of it."""
+    reconstruction: dict[str, object] = {"kind": Literal["none", "fit"]}
+    if config["reconstruction"].get("kind") != "fit":
+        return {"reconstruction": reconstruction}
+    return {
+        "reconstruction": reconstruction | settings(FIT) | settings(TRAJECTORIES),
+        "scene": {"part": Literal["all", "train", "test"], **settings(SCENE)},
+        "views": settings(RENDER) | settings(EVALUATE_VIEWS),
+    }
+
+
 def _method(config: dict) -> dict[str, object]:
     """What a file of the group ``method`` sets: a method of ours, or a peer to be measured against."""
     labels = {"name": str, "label": str}
@@ -129,6 +159,8 @@ def _method(config: dict) -> dict[str, object]:
     if benchmark:
         own = {n: t for n, t in settings(benchmark).items() if n not in OF_STAGES}
         return {"animate": labels, "benchmark": own}
+    if config["pipeline"] == "reconstruct":
+        return {"animate": labels}
     function = animate_function(config["animate"].get("function", ""))
     return {"animate": labels | {"function": str, **settings(function)}, "parts": settings(PARTS)}
 

@@ -123,14 +123,17 @@ def _without_docstrings(tree: ast.Module) -> ast.Module:
     return tree
 
 
-def choices(folder: str, function: str, what: str, name: str) -> str:
-    """``tasks.<folder>.<name>:<function>``. Raises InputError, listing what there is, where there is none."""
-    known = sorted(
-        p.stem for p in (ROOT / "tasks" / folder).glob("*.py") if _defines(f"tasks.{folder}.{p.stem}", function)
-    )
+def choices(folders: tuple[str, ...], function: str, what: str, name: str) -> str:
+    """``tasks.<folder>.<name>:<function>`` of the first folder that has it. Raises InputError, listing what there is,
+    where none has."""
+    known: dict[str, str] = {}
+    for folder in folders:
+        for path in (ROOT / "tasks" / folder).glob("*.py"):
+            if _defines(f"tasks.{folder}.{path.stem}", function):
+                known.setdefault(path.stem, folder)
     if name not in known:
-        raise InputError(what, expected=f"one of {', '.join(known)}", found=repr(name))
-    return f"tasks.{folder}.{name}:{function}"
+        raise InputError(what, expected=f"one of {', '.join(sorted(known))}", found=repr(name))
+    return f"tasks.{known[name]}.{name}:{function}"
 
 
 def _defines(module: str, function: str) -> bool:

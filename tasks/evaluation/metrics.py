@@ -43,6 +43,7 @@ METRICS: dict[str, Metric] = {
     "skeleton_rmse": Metric("skeleton RMSE", "length", "lower", "LBS of the skeleton alone on the training frames"),
     "skeleton_rmse_pct": Metric("skeleton RMSE", "percent", "lower", "the same in % of the diagonal", 2),
     "bones_count": Metric("bones", "count", "none", "number of free-form bones B", 0),
+    "bone_fragments": Metric("pieces a bone", "ratio", "lower", "connected pieces of the points that a bone holds", 2),
     "joints_count": Metric("joints", "count", "none", "number of joints J", 0),
     "joint_f1": Metric("joint F1", "ratio", "higher", "joints matched to true ones within 5 % of the diagonal", 3),
     "joint_f1_fine": Metric("joint F1, 2.5 %", "ratio", "higher", "the same within 2.5 %", 3),

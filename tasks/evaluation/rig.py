@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from tasks.evaluation.fragments import bone_fragments
 from tasks.evaluation.joints import counting_joints, joint_scores
 from tasks.evaluation.metrics import FRAMES_AT_ONCE, declared, squared_errors
 from tasks.geometry import kinematics, measure
@@ -40,6 +41,7 @@ def evaluate_rig(
         "bones_rmse": bones_rmse,
         "bones_rmse_pct": 100.0 * bones_rmse / diagonal,
         "bones_count": float(skinning.transforms.shape[1]),
+        "bone_fragments": bone_fragments(canonical, skinning),
         "skeleton_rmse": skeleton_rmse,
         "skeleton_rmse_pct": 100.0 * skeleton_rmse / diagonal,
         "joints_count": float(len(skeleton.parents)),

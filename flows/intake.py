@@ -65,6 +65,8 @@ def _meshes(config: dict, add) -> Nodes:
             do="add reconstruction=cpu",
         )
     motion = add("dataset", schema.load_function(kind), config["dataset"], "motion")["motion"]
+    if "scene" in config:
+        motion = add("shown", schema.SCENE_MOTION, config["scene"], "motion", motion=motion)["motion"]
     about = add("about", schema.ABOUT, {}, "about", motion=motion)["about"]
     return {"motion": motion, "about": about} | _split(config, add, motion)
 

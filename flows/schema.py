@@ -33,6 +33,7 @@ GIVEN_POSES = "tasks.skeleton.given:given_poses"
 POSES = "tasks.skeleton.poses:fit_poses"
 DATABASE = "tasks.motion.database:build_database"
 PARTS = "tasks.motion.parts:find_parts"
+SCENE_MOTION = "tasks.captures.scenes:scene_motion"
 SCENE = "tasks.captures.scenes:render_scene"
 FIT = "tasks.reconstruction.fit:fit"
 TRAJECTORIES = "tasks.reconstruction.motion:motion_of"
@@ -145,7 +146,7 @@ def _images(config: dict) -> dict[str, object]:
         return {"reconstruction": reconstruction}
     return {
         "reconstruction": reconstruction | settings(FIT) | settings(TRAJECTORIES),
-        "scene": {"part": Literal["all", "train", "test"], **settings(SCENE)},
+        "scene": {"part": Literal["all", "train", "test"], **settings(SCENE_MOTION), **settings(SCENE)},
         "views": settings(RENDER) | settings(EVALUATE_VIEWS),
     }
 

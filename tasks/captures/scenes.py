@@ -30,7 +30,12 @@ def scene_motion(
     evenly, first and last among them; resample: that many, also more than there are, each clip by cubic interpolation
     over time (only where no skeleton comes with the data). Raises InputError for an unknown clip and numbers out of
     range.
+
+    Where the data has no rest shape, its first frame becomes one: colours are painted on it, whichever frames are
+    rendered later.
     """
+    if motion.rest is None:
+        motion = replace(motion, rest=motion.points[0])
     if clip is not None:
         if clip not in motion.clip_names:
             raise InputError("scene.clip", expected=f"one of {', '.join(motion.clip_names)}", found=repr(clip))

@@ -25,6 +25,11 @@ X, Y, A, B, C, OPACITY, RED, GREEN, BLUE, DEPTH, EXTENT_X, EXTENT_Y = range(12)
 SPLAT = 12
 # columns of a pair's gradient: of colour and depth, and moments 1, x, y, xx, xy, yy of the gradient of sigma
 MOMENTS = 10
+# rows of a tile's pixels, in one array so that the compiler sees that they do not overlap: their place, the
+# transmittance so far (0 once the pixel is full), sums of colour, depth and alpha (on the way back: slopes by them),
+# on the way back: the sum of w u that is still to come
+AT_X, AT_Y, LIGHT, OF_RED, OF_GREEN, OF_BLUE, OF_FAR, OF_COVER, BEHIND = range(9)
+STATES = 9
 # exp(-s) = p(s)^8 for 0 <= s <= CUT, beyond which alpha < MIN_ALPHA; relative error below 2e-8
 CUT = 5.6
 _FIT = np.polynomial.chebyshev.Chebyshev.interpolate(lambda s: np.exp(-s / 8), 6, domain=[0, CUT])
@@ -33,7 +38,7 @@ P0, P1, P2, P3, P4, P5, P6 = (float(c) for c in _FIT.convert(kind=np.polynomial.
 FAST = {"reassoc", "contract", "nsz", "arcp"}  # sums in any order, fixed when compiled; NaN stays NaN
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def tile_box(splat, across, down):
     """First and last column and row of the tiles under a Gaussian's extent; empty where it is out of the image."""
     left = math.ceil(splat[X] - splat[EXTENT_X] - 0.5) // TILE
@@ -43,7 +48,7 @@ def tile_box(splat, across, down):
     return max(left, 0), min(right, across - 1), max(top, 0), min(bottom, down - 1)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def least(a, b, c, dx0, dx1, dy0, dy1):
     """Smallest (a dx^2 + c dy^2) / 2 + b dx dy in a box: zero inside, else on an edge that faces the centre."""
     if dx0 <= 0 <= dx1 and dy0 <= 0 <= dy1:
@@ -60,7 +65,7 @@ def least(a, b, c, dx0, dx1, dy0, dy1):
     return best
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def touches(splat, reach, column, row):
     """True where some pixel of a tile may lie within sigma <= reach."""
     dx0 = column * TILE + 0.5 - splat[X]
@@ -68,7 +73,7 @@ def touches(splat, reach, column, row):
     return least(splat[A], splat[B], splat[C], dx0, dx0 + (TILE - 1), dy0, dy0 + (TILE - 1)) <= reach
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def count_pairs(first, last, splats, across, down, counts):
     """Tiles of each Gaussian first..last-1 into counts."""
     for i in range(first, last):
@@ -81,7 +86,7 @@ def count_pairs(first, last, splats, across, down, counts):
         counts[i] = found
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def list_pairs(splats, across, down, pair_start):
     """Pairs by tile: (tiles + 1,) where each tile's begin, (P,) their Gaussians from near to far, (P,) their numbers.
 
@@ -114,7 +119,7 @@ def list_pairs(splats, across, down, pair_start):
     return tile_start, splat_of, number_of
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
 def blend(first, last, across, splats, tile_start, splat_of, background, rgb, alpha, depth, tile_end):
     """Blends tiles first..last-1. rgb: (H, W, 3); alpha, depth: (H, W); tile_end: where each tile was full."""
     real = splats.dtype.type
@@ -122,59 +127,57 @@ def blend(first, last, across, splats, tile_start, splat_of, background, rgb, al
     p0, p1, p2, p3, p4, p5, p6 = real(P0), real(P1), real(P2), real(P3), real(P4), real(P5), real(P6)
     zero, half, cut = real(0.0), real(0.5), real(CUT)
     max_alpha, min_alpha, floor = real(MAX_ALPHA), real(MIN_ALPHA), real(MIN_TRANSMITTANCE)
-    px, py = np.empty(PIXELS, splats.dtype), np.empty(PIXELS, splats.dtype)
-    light = np.empty(PIXELS, splats.dtype)  # transmittance so far; 0 once the pixel is full
-    red, green, blue = np.empty(PIXELS, splats.dtype), np.empty(PIXELS, splats.dtype), np.empty(PIXELS, splats.dtype)
-    cover, far = np.empty(PIXELS, splats.dtype), np.empty(PIXELS, splats.dtype)
+    pixels = np.empty((STATES, PIXELS), splats.dtype)
     for tile in range(first, last):
         x0, y0 = tile % across * TILE, tile // across * TILE
         for p in range(PIXELS):
-            px[p] = real(x0 + p % TILE) + half
-            py[p] = real(y0 + p // TILE) + half
-            light[p] = real(1.0)
-            red[p] = green[p] = blue[p] = cover[p] = far[p] = zero
+            pixels[AT_X, p] = real(x0 + p % TILE) + half
+            pixels[AT_Y, p] = real(y0 + p // TILE) + half
+            pixels[LIGHT, p] = real(1.0)
+            for k in range(OF_RED, BEHIND):
+                pixels[k, p] = zero
         place = tile_start[tile]
         while place < tile_start[tile + 1]:
             s = splats[splat_of[place]]
             x, y, a, b, c, o = s[X], s[Y], half * s[A], s[B], half * s[C], s[OPACITY]
             r, g, bl, z = s[RED], s[GREEN], s[BLUE], s[DEPTH]
             for p in range(PIXELS):
-                dx = px[p] - x
-                dy = py[p] - y
+                dx = pixels[AT_X, p] - x
+                dy = pixels[AT_Y, p] - y
                 sigma = min(a * dx * dx + c * dy * dy + b * dx * dy, cut)
                 e = p0 + sigma * (p1 + sigma * (p2 + sigma * (p3 + sigma * (p4 + sigma * (p5 + sigma * p6)))))
                 e = e * e
                 e = e * e
                 e = min(o * (e * e), max_alpha)
-                w = light[p] * (e if e >= min_alpha else zero)
-                after = light[p] - w
+                w = pixels[LIGHT, p] * (e if e >= min_alpha else zero)
+                after = pixels[LIGHT, p] - w
                 w = w if after > floor else zero
-                light[p] = after if after > floor else zero
-                red[p] += w * r
-                green[p] += w * g
-                blue[p] += w * bl
-                cover[p] += w
-                far[p] += w * z
+                pixels[LIGHT, p] = after if after > floor else zero
+                pixels[OF_RED, p] += w * r
+                pixels[OF_GREEN, p] += w * g
+                pixels[OF_BLUE, p] += w * bl
+                pixels[OF_COVER, p] += w
+                pixels[OF_FAR, p] += w * z
             place += 1
             if (place - tile_start[tile]) % CHECK == 0:
                 left = zero
                 for p in range(PIXELS):
-                    left += light[p]
+                    left += pixels[LIGHT, p]
                 if left == zero:
                     break
         tile_end[tile] = place
         for p in range(PIXELS):
             i, j = y0 + p // TILE, x0 + p % TILE
             if i < height and j < width:
-                rest = real(1.0) - cover[p]
-                rgb[i, j, 0] = red[p] + rest * background[0]
-                rgb[i, j, 1] = green[p] + rest * background[1]
-                rgb[i, j, 2] = blue[p] + rest * background[2]
-                alpha[i, j] = cover[p]
-                depth[i, j] = far[p] / cover[p] if cover[p] > zero else zero
+                rest = real(1.0) - pixels[OF_COVER, p]
+                rgb[i, j, 0] = pixels[OF_RED, p] + rest * background[0]
+                rgb[i, j, 1] = pixels[OF_GREEN, p] + rest * background[1]
+                rgb[i, j, 2] = pixels[OF_BLUE, p] + rest * background[2]
+                alpha[i, j] = pixels[OF_COVER, p]
+                depth[i, j] = pixels[OF_FAR, p] / pixels[OF_COVER, p] if pixels[OF_COVER, p] > zero else zero
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
 def blend_backward(
     first,
     last,
@@ -196,30 +199,31 @@ def blend_backward(
     alpha is T u - (sum of w u behind it) / (1 - alpha); that sum is the pixel's total less what has gone by.
     """
     real = splats.dtype.type
+    height, width = images[1].shape
     p0, p1, p2, p3, p4, p5, p6 = real(P0), real(P1), real(P2), real(P3), real(P4), real(P5), real(P6)
     zero, half, one, cut = real(0.0), real(0.5), real(1.0), real(CUT)
     max_alpha, min_alpha, floor = real(MAX_ALPHA), real(MIN_ALPHA), real(MIN_TRANSMITTANCE)
-    px, py = np.empty(PIXELS, splats.dtype), np.empty(PIXELS, splats.dtype)
-    light, behind = np.empty(PIXELS, splats.dtype), np.empty(PIXELS, splats.dtype)
-    slope = np.empty((5, PIXELS), splats.dtype)
-    red, green, blue, cover, far = slope[0], slope[1], slope[2], slope[3], slope[4]
+    pixels = np.empty((STATES, PIXELS), splats.dtype)
     for tile in range(first, last):
         if tile_start[tile] == tile_end[tile]:
             continue
         x0, y0 = tile % across * TILE, tile // across * TILE
         for p in range(PIXELS):
-            px[p] = real(x0 + p % TILE) + half
-            py[p] = real(y0 + p // TILE) + half
-            light[p] = one
-            pixel_slopes(y0 + p // TILE, x0 + p % TILE, p, background, images, slopes, slope, behind)
+            i, j = y0 + p // TILE, x0 + p % TILE
+            pixels[AT_X, p], pixels[AT_Y, p], pixels[LIGHT, p] = real(j) + half, real(i) + half, one
+            if i < height and j < width:
+                pixel_slopes(i, j, p, background, images, slopes, pixels)
+            else:
+                for k in range(OF_RED, STATES):
+                    pixels[k, p] = zero
         for place in range(tile_start[tile], tile_end[tile]):
             s = splats[splat_of[place]]
             x, y, a, b, c, o = s[X], s[Y], half * s[A], s[B], half * s[C], s[OPACITY]
             r, g, bl, z = s[RED], s[GREEN], s[BLUE], s[DEPTH]
             m0, m1, m2, m3, m4, m5, m6, m7, m8, m9 = zero, zero, zero, zero, zero, zero, zero, zero, zero, zero
             for p in range(PIXELS):
-                dx = px[p] - x
-                dy = py[p] - y
+                dx = pixels[AT_X, p] - x
+                dy = pixels[AT_Y, p] - y
                 sigma = min(a * dx * dx + c * dy * dy + b * dx * dy, cut)
                 e = p0 + sigma * (p1 + sigma * (p2 + sigma * (p3 + sigma * (p4 + sigma * (p5 + sigma * p6)))))
                 e = e * e
@@ -227,20 +231,22 @@ def blend_backward(
                 e = o * (e * e)
                 q = min(e, max_alpha)
                 q = q if q >= min_alpha else zero
-                before = light[p]
+                before = pixels[LIGHT, p]
                 w = before * q
                 after = before - w
                 w = w if after > floor else zero
                 q = q if after > floor else zero
-                light[p] = after if after > floor else zero
-                u = r * red[p] + g * green[p] + bl * blue[p] + z * far[p] + cover[p]
-                behind[p] -= w * u
-                t = q * (behind[p] / (one - q)) - w * u  # the slope by sigma: -alpha times that by alpha
+                pixels[LIGHT, p] = after if after > floor else zero
+                of_red, of_green, of_blue = pixels[OF_RED, p], pixels[OF_GREEN, p], pixels[OF_BLUE, p]
+                of_far = pixels[OF_FAR, p]
+                u = r * of_red + g * of_green + bl * of_blue + z * of_far + pixels[OF_COVER, p]
+                pixels[BEHIND, p] -= w * u
+                t = q * (pixels[BEHIND, p] / (one - q)) - w * u  # the slope by sigma: -alpha times that by alpha
                 t = t if e <= max_alpha else zero
-                m0 += w * red[p]
-                m1 += w * green[p]
-                m2 += w * blue[p]
-                m3 += w * far[p]
+                m0 += w * of_red
+                m1 += w * of_green
+                m2 += w * of_blue
+                m3 += w * of_far
                 m4 += t
                 m5 += t * dx
                 m6 += t * dy
@@ -251,27 +257,20 @@ def blend_backward(
             m[0], m[1], m[2], m[3], m[4], m[5], m[6], m[7], m[8], m[9] = m0, m1, m2, m3, m4, m5, m6, m7, m8, m9
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
-def pixel_slopes(i, j, p, background, images, slopes, slope, behind):
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
+def pixel_slopes(i, j, p, background, images, slopes, pixels):
     """The loss's slopes by what a pixel sums up (colour, alpha, alpha times depth), and the sum of w u over it all."""
-    zero = slope.dtype.type(0.0)
+    real = pixels.dtype.type
     rgb, alpha, depth = images
     of_rgb, of_alpha, of_depth = slopes
-    behind[p] = zero
-    if i >= alpha.shape[0] or j >= alpha.shape[1]:
-        for k in range(5):
-            slope[k, p] = zero
-        return
-    cover = zero
-    rest = slope.dtype.type(1.0) - alpha[i, j]
+    rest = real(1.0) - alpha[i, j]
+    cover, far, total = of_alpha[i, j], real(0.0), real(0.0)
     for k in range(3):
-        slope[k, p] = of_rgb[i, j, k]
+        pixels[OF_RED + k, p] = of_rgb[i, j, k]
         cover -= of_rgb[i, j, k] * background[k]
-        behind[p] += of_rgb[i, j, k] * (rgb[i, j, k] - rest * background[k])
-    cover += of_alpha[i, j]
-    slope[4, p] = zero
-    if alpha[i, j] > zero:
-        slope[4, p] = of_depth[i, j] / alpha[i, j]
-        cover -= slope[4, p] * depth[i, j]
-    slope[3, p] = cover
-    behind[p] += alpha[i, j] * (cover + slope[4, p] * depth[i, j])
+        total += of_rgb[i, j, k] * (rgb[i, j, k] - rest * background[k])
+    if alpha[i, j] > real(0.0):
+        far = of_depth[i, j] / alpha[i, j]
+        cover -= far * depth[i, j]
+    pixels[OF_COVER, p], pixels[OF_FAR, p] = cover, far
+    pixels[BEHIND, p] = total + alpha[i, j] * (cover + far * depth[i, j])

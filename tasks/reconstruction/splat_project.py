@@ -28,7 +28,7 @@ from tasks.reconstruction.splat_blend import (
 SLACK = 1e-3  # pixels and share that an extent is widened by, so that rounding cuts nothing off
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def project(first, last, means, scales, opacities, sh, quaternions, view, intrinsics, size, splats):
     """Rows first..last-1 of splats (N, SPLAT); depth is infinite where not drawn. quaternions: None for spheres."""
     real = means.dtype.type
@@ -70,7 +70,7 @@ def project(first, last, means, scales, opacities, sh, quaternions, view, intrin
             s[RED + k] = max(value, real(0.0))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def camera_point(mean, view):
     """A mean in the camera's frame."""
     x = view[0, 0] * mean[0] + view[0, 1] * mean[1] + view[0, 2] * mean[2] + view[0, 3]
@@ -79,7 +79,7 @@ def camera_point(mean, view):
     return x, y, z
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def camera_centre(view):
     """Where the camera stands: -R^T t."""
     out = np.zeros(3, view.dtype)
@@ -89,7 +89,7 @@ def camera_centre(view):
     return out
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def slopes(x, y, z, intrinsics, height, width):
     """x/z and y/z held to the image and a margin; 1 or 0 each: whether it is free."""
     real = intrinsics.dtype.type
@@ -107,14 +107,14 @@ def slopes(x, y, z, intrinsics, height, width):
     return held_u, held_v, real(held_u == u), real(held_v == v)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def flat_covariance(scale, u, v, z, intrinsics):
     """s^2 J J^T: a sphere's projected covariance."""
     gx, gy = scale * intrinsics[0, 0] / z, scale * intrinsics[1, 1] / z
     return gx * gx * (1 + u * u), gx * gy * u * v, gy * gy * (1 + v * v)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def quaternion_matrix(q):
     """The rotation of a quaternion w x y z of any length."""
     out = np.empty((3, 3), q.dtype)
@@ -126,7 +126,7 @@ def quaternion_matrix(q):
     return out
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def image_slope(u, v, z, view, intrinsics):
     """J times the view's rotation, (2, 3)."""
     out = np.empty((2, 3), view.dtype)
@@ -136,7 +136,7 @@ def image_slope(u, v, z, view, intrinsics):
     return out
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def frame(turn, u, v, z, view, intrinsics):
     """A Gaussian's axes in the image: J times the view's rotation times its own, (2, 3)."""
     m = image_slope(u, v, z, view, intrinsics)
@@ -148,7 +148,7 @@ def frame(turn, u, v, z, view, intrinsics):
     return out
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def square(axes, scale):
     """axes diag(scale^2) axes^T as xx, xy, yy."""
     xx = xy = yy = axes.dtype.type(0.0)
@@ -160,7 +160,7 @@ def square(axes, scale):
     return xx, xy, yy
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def direction(mean, centre, unit):
     """The unit direction from the camera to a mean; returns their distance."""
     x, y, z = mean[0] - centre[0], mean[1] - centre[1], mean[2] - centre[2]
@@ -169,7 +169,7 @@ def direction(mean, centre, unit):
     return length
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def sh_basis(unit, count, out):
     """The first `count` real spherical harmonics of a direction."""
     real = unit.dtype.type
@@ -194,7 +194,7 @@ def sh_basis(unit, count, out):
         out[15] = -c * x * (x * x - 3 * y * y)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def sh_slope(unit, count, out):
     """Slopes of the basis along x, y, z, (count, 3)."""
     real = unit.dtype.type
@@ -222,7 +222,7 @@ def sh_slope(unit, count, out):
         out[15, 0], out[15, 1] = -3 * c * (x * x - y * y), 6 * c * x * y
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def project_backward(
     first,
     last,
@@ -275,7 +275,7 @@ def project_backward(
             of_means[i, k] = (dx + gx) * view[0, k] + (dy + gy) * view[1, k] + dz * view[2, k] + shift[k]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def of_covariance(a, b, c, mxx, mxy, myy):
     """-K G K with K the inverse covariance and G the gradient by it, from the moments of sigma's slope."""
     half = type_of(a, 0.5)
@@ -285,13 +285,13 @@ def of_covariance(a, b, c, mxx, mxy, myy):
     return -(txx * a + txy * b), -(txx * b + txy * c), -(tyx * b + tyy * c)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def type_of(like, value):
     """A constant in the floating type of another number, which keeps float32 sums in float32."""
     return type(like)(value)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def back_flat(scale, u, v, z, intrinsics, hxx, hxy, hyy):
     """Gradients by scale, u, v and z (through 1/z^2 alone) of :func:`flat_covariance`."""
     gx, gy = scale * intrinsics[0, 0] / z, scale * intrinsics[1, 1] / z
@@ -300,7 +300,7 @@ def back_flat(scale, u, v, z, intrinsics, hxx, hxy, hyy):
     return 2 * value / scale, 2 * xx * u + xy * v, 2 * yy * v + xy * u, -2 * value / z
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def back_turned(scale, q, u, v, z, view, intrinsics, hxx, hxy, hyy, of_scale, of_quaternion):
     """Gradients by u, v and z (through J alone); those by scale and quaternion are written."""
     real = scale.dtype.type
@@ -328,7 +328,7 @@ def back_turned(scale, q, u, v, z, view, intrinsics, hxx, hxy, hyy, of_scale, of
     return du, dv, dz
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def back_quaternion(q, g, out):
     """The gradient by a quaternion of any length, from that by its rotation matrix."""
     length = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
@@ -342,7 +342,7 @@ def back_quaternion(q, g, out):
     out[2], out[3] = (dy - y * along) / length, (dz - z * along) / length
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def back_shade(mean, centre, sh, splat, total, basis, basis_slope, of_sh, of_mean):
     """Gradients by the coefficients and, through the direction, by the mean."""
     real = mean.dtype.type

@@ -7,11 +7,13 @@ config answers at once, before torch or Prefect are imported.
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from glob import glob, has_magic
 from pathlib import Path
+from typing import Literal
 
 from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -21,13 +23,14 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from flows import schema
-from flows.source import ROOT
+from flows.source import ROOT, signature
 from tasks.errors import InputError
 
 CONF = ROOT / "conf"
 NO_ABLATION = "none"
 ADDED = ("experiment", "ablation")  # groups that the config does not choose from by itself: +GROUP=CHOICE
 SWEPT = ("datasets", "methods", "ablations")
+SWEEP = {**dict.fromkeys(SWEPT, list[str] | None), "seeds": list[int] | None, "absent": Literal["fail", "skip"]}
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,18 @@ class Case:
     method: str
     variant: str
     config: dict
+
+    @property
+    def seed(self) -> int:
+        """What the method's own randomness starts from; bones and data keep the seed of the run."""
+        own = self.config["method_seed"]
+        return self.config["seed"] if own is None else own
+
+    @property
+    def absent(self) -> bool:
+        """Its file is not there, and the experiment does without it then."""
+        path = self.config["dataset"].get("path")
+        return self.config["sweep"]["absent"] == "skip" and bool(path) and not Path(path).expanduser().exists()
 
     @property
     def data(self) -> str:
@@ -90,8 +105,8 @@ def _sweep(overrides: list[Override], point: list[Override], compose_once, used:
     used |= {o.input_line for o in overrides if o.key_or_group in choices}
     base, set_here = _set(compose_once(_group_overrides(choices)), values)
     used |= {text for text in set_here if text.startswith("sweep.")}
-    sweep = schema.check(_plain(base)["sweep"], dict.fromkeys(SWEPT, list[str] | None), "sweep.")
-    unnamed = ("seed", "dataset", "dataset.path", "method")  # have columns of their own
+    sweep = schema.check(_plain(base)["sweep"], SWEEP, "sweep.")
+    unnamed = ("seed", "method_seed", "dataset", "dataset.path", "method")  # have columns of their own
     label = ",".join(o.input_line.lstrip("+") for o in point if o.key_or_group not in unnamed)
     for dataset, method, ablation in itertools.product(*(sweep[axis] or [None] for axis in SWEPT)):
         chosen = {"dataset": dataset, "method": method} | choices  # what the user typed wins over the experiment
@@ -100,22 +115,42 @@ def _sweep(overrides: list[Override], point: list[Override], compose_once, used:
         composed, set_here = _set(compose_once(_group_overrides(chosen)), values)
         used |= set_here
         config = _plain(composed)
-        config = schema.check(config, schema.schema(config))
+        config = schema.check(config, schema.schema(config, SWEEP))
         variant = ",".join(filter(None, [ablation, label])) or NO_ABLATION
         name = chosen["dataset"] or config["dataset"]["kind"]
-        for node in _files(config["dataset"]):
-            yield Case(name, config["animate"]["name"], variant, config | {"dataset": node})
+        for node, seed in itertools.product(_files(config["dataset"]), _seeds(config)):
+            yield Case(name, config["animate"]["name"], variant, config | {"dataset": node, "method_seed": seed})
+
+
+def _seeds(config: dict) -> list[int | None]:
+    """The seeds that the method is run with: the experiment's, but for a method without randomness one is enough."""
+    seeds, function = config["sweep"]["seeds"], config["animate"].get("function")
+    if not seeds or config["method_seed"] is not None or function is None:
+        return [config["method_seed"]]
+    return seeds if "seed" in signature(schema.animate_function(function))[1] else seeds[:1]
 
 
 def _files(dataset: dict) -> list[dict]:
-    """The dataset's node for every file that a path with wildcards stands for."""
+    """The dataset's node for every file that a path with {a,b} and wildcards stands for."""
     path = dataset.get("path")
-    if not path or not has_magic(path) or Path(path).exists():
+    if not path or Path(path).exists():
         return [dataset]
-    found = sorted(glob(str(Path(path).expanduser())))
-    if not found:
-        raise InputError("dataset.path", expected="a file or folder", found=f"nothing that matches {path}")
+    found = []
+    for one in _alternatives(path):
+        matches = sorted(glob(str(Path(one).expanduser()))) if has_magic(one) else [one]
+        if not matches:
+            raise InputError("dataset.path", expected="a file or folder", found=f"nothing that matches {one}")
+        found += matches
     return [dataset | {"path": one} for one in found]
+
+
+def _alternatives(path: str) -> list[str]:
+    """a/{b,c}.npz as a/b.npz and a/c.npz, as a shell has it."""
+    choice = re.search(r"\{([^{}]*,[^{}]*)\}", path)
+    if not choice:
+        return [path]
+    head, tail = path[: choice.start()], path[choice.end() :]
+    return [f"{head}{one}{rest}" for one in choice[1].split(",") for rest in _alternatives(tail)]
 
 
 def _group_overrides(chosen: dict[str, str | None]) -> tuple[str, ...]:

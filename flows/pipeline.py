@@ -35,7 +35,7 @@ def plan(case: Case, graph: Graph) -> Planned:
     name = f"{case.data} {case.method}" + (f" {case.variant}" if case.variant != NO_ABLATION else "")
 
     def add(stage: str, function: str, node: dict, outputs: str, **inputs: object) -> Node:
-        settings = schema.arguments(function, node, config["seed"])
+        settings = schema.arguments(function, node, case.seed if stage == "animate" else config["seed"])
         path = settings.get("path") if stage == "dataset" else None
         return graph.add(stage, function, settings, outputs=tuple(outputs.split()), case=name, path=path, **inputs)
 
@@ -55,6 +55,7 @@ def plan(case: Case, graph: Graph) -> Planned:
         unseen = {n: nodes[n] for n in ("animation", "test", "canonical")}
         metrics.append(add("evaluate", schema.EVALUATE, config["evaluate"], "metrics", **unseen))
         metrics += intake.unseen_views(config, add, nodes)
+        metrics += _left_out(case, add, nodes)
     return Planned(case, name, tuple(metrics), nodes)
 
 
@@ -99,11 +100,37 @@ def _animation(config: dict, add, nodes: dict[str, Output]) -> dict[str, Output]
     """Stage 4: the database, and the method's answer to the unseen poses."""
     inputs = {n: nodes[n] for n in ("train", "skinning", "poses")}
     database = add("database", schema.DATABASE, {}, "database", **inputs)["database"]
-    training = {n: nodes[n] for n in ("canonical", "skinning", "skeleton", "parts")}
-    training |= {"motion": nodes["train"], "database": database}
+    found = {"database": database}
+    return found | {"animation": _answer(config, add, nodes | found, nodes["train"], nodes["query"], nodes["test"])}
+
+
+def _answer(config: dict, add, nodes: dict[str, Output], motion: Output, query: Output, truth: Output) -> Output:
+    """The method, trained on a motion, on the poses of a query. truth: only for the floor below all methods."""
     method = schema.animate_function(config["animate"]["function"])
-    animation = add("animate", method, config["animate"], "animation", training=training, query=nodes["query"])
-    return {"animation": animation["animation"]}
+    if method == schema.FLOOR:
+        return add("animate", method, {}, "animation", unseen=truth, skinning=nodes["skinning"])["animation"]
+    training = {n: nodes[n] for n in ("canonical", "skinning", "skeleton", "parts", "database")}
+    training |= {"motion": motion}
+    return add("animate", method, config["animate"], "animation", training=training, query=query)["animation"]
+
+
+def _left_out(case: Case, add, nodes: dict[str, Output]) -> list[Node]:
+    """The method again without one training clip, in turn: on the unseen clips and on the one left out."""
+    config = case.config
+    runs, of = config["evaluate"]["left_out"], config["evaluate"]["left_out_of"]
+    if runs == 0 or (of is not None and case.dataset not in of):
+        return []
+    scores = {}
+    for run in range(runs):
+        inputs = {n: nodes[n] for n in ("train", "test", "skinning", "poses", "query")}
+        rest = add(
+            "left_out", schema.LEAVE_OUT, {"run": run, "runs": runs}, "motion skinning database asked truth", **inputs
+        )
+        without = nodes | {n: rest[n] for n in ("skinning", "database")}
+        answer = _answer(config, add, without, rest["motion"], rest["asked"], rest["truth"])
+        inputs = {"animation": answer, "truth": rest["truth"], "test": nodes["test"]}
+        scores[f"run_{run}"] = add("evaluate", schema.EVALUATE_LEFT_OUT, {}, "metrics", **inputs)["metrics"]
+    return [add("evaluate", schema.SPREAD, {}, "metrics", scores=scores)]
 
 
 def _skeleton(settings: dict, add, train, test, canonical, skinning) -> dict[str, Output]:
@@ -146,6 +173,7 @@ def plan_pictures(planned: list[Planned], graph: Graph) -> list[Node]:
     planned = [p for p in planned if "skinning" in p.nodes]  # benchmarks make none
     for data in dict.fromkeys(p.case.data for p in planned):
         cases = [p for p in planned if p.case.data == data]
+        cases = [p for p in cases if p.case.seed == min(q.case.seed for q in cases if q.case.method == p.case.method)]
         first = [p for p in cases if p.case.variant == cases[0].case.variant]
         shown = first if len(first) > 1 else cases
         shown = shown if len(shown) <= PANELS else [shown[0], *shown[1 - PANELS :]]

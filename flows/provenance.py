@@ -23,7 +23,7 @@ def provenance(cases: list[Case], graph: Graph, refs: dict[str, Ref], computed: 
         "git": git_state(),
         "versions": versions(),
         "machine": {"system": platform.platform(), "python": platform.python_version(), "cpu": platform.machine()},
-        "seeds": sorted({case.config["seed"] for case in cases}),
+        "seeds": sorted({seed for case in cases for seed in (case.config["seed"], case.seed)}),
         "inputs": inputs(graph),
         "cases": [
             {"dataset": c.dataset, "method": c.method, "variant": c.variant, "config": portable(c.config)}
@@ -47,7 +47,7 @@ def provenance(cases: list[Case], graph: Graph, refs: dict[str, Ref], computed: 
 
 def portable(config: dict) -> dict:
     """A config without what belongs to one machine: the store, the runner, the folders of inputs and reports."""
-    kept = {name: value for name, value in config.items() if name not in ("store", "runner")}
+    kept = {name: value for name, value in config.items() if name not in ("store", "runner", "data_root")}
     if isinstance(kept["dataset"].get("path"), str):
         kept["dataset"] = kept["dataset"] | {"path": _without_folders(kept["dataset"]["path"])}
     kept["report"] = {name: value for name, value in kept["report"].items() if name != "path"}

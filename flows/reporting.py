@@ -16,6 +16,7 @@ from flows.store import Ref, Store
 
 UNSEEN = ("rmse_pct", "rmse", "rmse_coordinate")
 MOTION = ("velocity_rmse", "speed_ratio", "max_error")
+LEFT_OUT = ("rmse_spread", "rmse_left_out", "rmse_left_out_spread")
 RIG = ("bones_rmse_pct", "bones_count", "skeleton_rmse_pct", "joints_count")
 # of each benchmark: what decides, then the numbers behind it by the titles of their tables
 BENCHMARKS = {
@@ -63,15 +64,16 @@ def write(
     refs: dict[str, Ref],
     computed: set[str],
     store: Store,
+    notes: list[str],
 ) -> Report:
-    """Writes a report's folder and returns what to show of it."""
+    """Writes a report's folder and returns what to show of it. notes: remarks on the run, for the first table."""
     from tasks.evaluation import report, typeset
     from tasks.evaluation.rows import join
 
     settings = planned[0].case.config["report"]
     rows = join([_rows(p, refs, store) for p in planned])
     remarks = dict.fromkeys(f"{a.name}: {note}." for a in (_about(p, refs, store) for p in planned) for note in a.notes)
-    tables = _tables(planned, rows, settings, list(remarks))
+    tables = _tables(planned, rows, settings, list(remarks), notes)
     figures = [(node.cases[0], store.load(refs[node.id], "picture")) for node in pictures]
     figures += _curve(planned, rows, settings["curve"])
     figures += _charts(rows, {p.case.method: p.case.config["animate"]["label"] for p in planned})
@@ -93,13 +95,13 @@ def _rows(case: Planned, refs: dict[str, Ref], store: Store):
         "subject": _subject(case, refs, store),
         "method": case.case.method,
         "variant": _variant(case),
-        "seed": config["seed"],
+        "seed": case.case.seed,
     }
     found = [refs[node.id] for node in case.metrics]
     return join([rows_of(store.load(ref, "metrics"), key=ref.key, **labels) for ref in found])
 
 
-def _tables(planned: list[Planned], rows, settings: dict, remarks: list[str]) -> list:
+def _tables(planned: list[Planned], rows, settings: dict, remarks: list[str], run_notes: list[str]) -> list:
     from tasks.evaluation.paper import paper_of
     from tasks.evaluation.tables import build
 
@@ -118,6 +120,7 @@ def _tables(planned: list[Planned], rows, settings: dict, remarks: list[str]) ->
             if datasets[dataset]["stands_for"]
         },
         "baselines": settings["baselines"],
+        "bounds": settings["bounds"],
     }
     if planned[0].case.config["pipeline"] == "make_garments":
         return _garment_tables(rows, settings, remarks, common)
@@ -126,9 +129,16 @@ def _tables(planned: list[Planned], rows, settings: dict, remarks: list[str]) ->
     tables = []
     if rows["metric"].isin(UNSEEN).any():
         printed = {"paper": paper, "paper_table": settings["paper_table"]} if settings["paper_table"] else {}
-        notes = _notes(planned, settings)
+        notes = [*_notes(planned, settings), *run_notes]
         tables.append(build(rows, title=settings["title"], metrics=UNSEEN, notes=notes, **printed, **common))
+        tables += _gain_tables(rows, settings, paper, common)
         tables.append(build(rows, title="Motion of the same results", metrics=MOTION, notes=[], **common))
+    if rows["metric"].isin(LEFT_OUT).any():
+        runs = planned[0].case.config["evaluate"]["left_out"]
+        note = f"Trained {runs} times, each time without one training clip: how far that moves the error on the unseen "
+        note += "clips, and the error on the clips that were left out, bones kept. Settings are chosen by the latter."
+        plain = common | {"baselines": []}
+        tables.append(build(rows, title="One training clip left out", metrics=LEFT_OUT, notes=[note], **plain))
     shared = common | {"labels": common["labels"] | {planned[-1].case.method: "all methods"}, "baselines": []}
     rig_notes = ["Errors on the training frames that bones and skeleton were fitted to.", *remarks]
     tables.append(build(lead, title="Bones and skeleton", metrics=RIG, notes=rig_notes, **shared))
@@ -148,6 +158,24 @@ def _garment_tables(rows, settings: dict, remarks: list[str], common: dict) -> l
     clips = clips.assign(method=split.str[1], metric=split.str[0])
     shown = [(settings["title"], rows, (*CLOTH, "points_count"), notes), ("Clip by clip", clips, CLOTH, [])]
     return [unranked(build(r, title=title, metrics=m, notes=n, **common)) for title, r, m, n in shown]
+
+
+def _gain_tables(rows, settings: dict, paper, common: dict) -> list:
+    """How far each of the methods asked for lies below every other one, beside what the paper prints."""
+    from tasks.evaluation.gains import GAIN, gains, printed_gains
+    from tasks.evaluation.tables import build, unranked
+
+    number, tables = settings["paper_table"], []
+    for method in settings["gains_of"]:
+        found = gains(rows, method, without=settings["bounds"])
+        if found.empty:
+            continue
+        printed = {"paper": printed_gains(paper, number, method), "paper_table": number} if number else {}
+        title = f"How far {common['labels'].get(method, method)} lies below every other row"
+        notes = ["The paper's are computed from the RMSE that it prints."] if number else []
+        plain = common | {"baselines": []}
+        tables.append(unranked(build(found, title=title, metrics=[GAIN], notes=notes, **printed, **plain)))
+    return tables
 
 
 def _benchmark_tables(planned: list[Planned], rows, settings: dict, common: dict) -> list:

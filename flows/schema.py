@@ -44,6 +44,10 @@ EVALUATE_VIEWS = "tasks.evaluation.images:evaluate_views"
 EVALUATE_PATHS = "tasks.evaluation.paths:evaluate_paths"
 EVALUATE = "tasks.evaluation.metrics:evaluate"
 EVALUATE_RIG = "tasks.evaluation.rig:evaluate_rig"
+FLOOR = "tasks.bones.refit:compression_floor"
+LEAVE_OUT = "tasks.motion.left_out:leave_out"
+EVALUATE_LEFT_OUT = "tasks.evaluation.left_out:evaluate_left_out"
+SPREAD = "tasks.evaluation.left_out:spread"
 BENCHMARKS = {
     "benchmark_bones": "tasks.benchmarks.bones:benchmark_bones",
     "benchmark_skeleton": "tasks.benchmarks.skeleton:benchmark_skeleton",
@@ -73,10 +77,13 @@ REPORT = {
     "path": str,
     "figures": bool,
     "baselines": list[str],
+    "bounds": list[str],
+    "gains_of": list[str],
     "paper_table": int | None,
     "curve": list[str] | None,
     "note": str,
 }
+LEFT_OUT = {"left_out": int, "left_out_of": list[str] | None}
 FROM_RUN = {"seed"}  # arguments that come from the top of the config
 OF_STAGES = {"clustering", "decomposition", "tracing"}  # a benchmark's arguments that are whole stages' settings
 RENAMED = {"lambda_": "lambda"}  # Python keywords that are the field's names in the config
@@ -93,12 +100,12 @@ def is_capture(kind: str) -> bool:
 
 
 def animate_function(function: str) -> str:
-    """The method's function: ``tasks/methods/<function>.py``."""
-    return choices(("methods",), "animate", "animate.function", function)
+    """The method's function: ``tasks/methods/<function>.py``, or the floor below all methods, which sees the truth."""
+    return FLOOR if function == FLOOR.split(":")[1] else choices(("methods",), "animate", "animate.function", function)
 
 
-def schema(config: dict) -> dict[str, object]:
-    """The type of every key that this config may have, nested as the config is."""
+def schema(config: dict, sweep: dict[str, object]) -> dict[str, object]:
+    """The type of every key that this config may have, nested as the config is. sweep: those of the grid."""
     dataset = config["dataset"]
     pipeline = config["pipeline"]
     skeleton: dict[str, object] = {"kind": Literal["curve", "given"]}
@@ -118,6 +125,8 @@ def schema(config: dict) -> dict[str, object]:
     bones |= settings(BONES.get(config["bones"].get("kind"), SSDR))
     return {
         "seed": int,
+        "method_seed": int | None,
+        "data_root": str,
         "pipeline": Literal[PIPELINES],
         "dataset": {
             "kind": str,
@@ -130,12 +139,12 @@ def schema(config: dict) -> dict[str, object]:
         "bones": bones,
         "skeleton": skeleton | settings(CANONICAL, rename={"choice": "canonical"}),
         **_method(config),
-        "evaluate": settings(EVALUATE) | settings(EVALUATE_RIG),
+        "evaluate": settings(EVALUATE) | settings(EVALUATE_RIG) | LEFT_OUT,
         "report": REPORT,
         "store": {"path": str},
         "memory": {"max_gb": float | None},
         "runner": {"kind": Literal["threads", "processes"], "workers": int},
-        "sweep": {"datasets": list[str] | None, "methods": list[str] | None, "ablations": list[str] | None},
+        "sweep": sweep,
     }
 
 

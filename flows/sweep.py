@@ -41,6 +41,11 @@ def run_sweep(cases: list[Case], show: bool = True) -> Path:
     Raises InputError for bad data and StageFailed for a defect, after every stage that could run has run: what was
     finished stays in the store.
     """
+    absent = list(dict.fromkeys(case.config["dataset"]["path"] for case in cases if case.absent))
+    cases = [case for case in cases if not case.absent]
+    if not cases:
+        do = "set data_root to the folder that holds it, or dataset.path"
+        raise InputError("dataset.path", expected="the file of at least one dataset", found=f"no {absent[0]}", do=do)
     config = cases[0].config
     Store(config["store"]["path"])  # a store that cannot be used is said before anything starts
     with server() as ready:
@@ -49,10 +54,21 @@ def run_sweep(cases: list[Case], show: bool = True) -> Path:
         pictures = plan_pictures(planned, graph) if config["report"]["figures"] else []
         files = plan_files(planned, graph)
         ready()
-        return Path(_flow(config, graph, planned, pictures, files, show)(config["report"]["name"], len(cases)))
+        left_out = [f"Not run: {Path(path).stem}, for its file is absent." for path in absent]
+        return Path(
+            _flow(config, graph, planned, pictures, files, left_out, show)(config["report"]["name"], len(cases))
+        )
 
 
-def _flow(config: dict, graph: Graph, planned: list[Planned], pictures: list[Node], files: list[Output], show: bool):
+def _flow(
+    config: dict,
+    graph: Graph,
+    planned: list[Planned],
+    pictures: list[Node],
+    files: list[Output],
+    notes: list[str],
+    show: bool,
+):
     """The flow of a sweep; its parameters are what the run's page shows."""
     from prefect import flow
 
@@ -62,7 +78,9 @@ def _flow(config: dict, graph: Graph, planned: list[Planned], pictures: list[Nod
 
         bar = ProgressArtifact(experiment, len(graph.nodes))
         with Progress(graph, show, bar.update) as progress:
-            report, computed = _computed_report(config, graph, planned, pictures, files, progress)
+            for note in notes:
+                progress.note(note)
+            report, computed = _computed_report(config, graph, planned, pictures, files, notes, progress)
         publish(report.folder, report.tables)
         progress.finish(report.shown, report.folder, computed)
         return str(report.folder)
@@ -76,6 +94,7 @@ def _computed_report(
     planned: list[Planned],
     pictures: list[Node],
     files: list[Output],
+    notes: list[str],
     progress: Progress,
 ) -> tuple[Report, int]:
     """The report and how many stages were computed for it."""
@@ -88,7 +107,7 @@ def _computed_report(
         computed |= outcome.computed
         raise_first(graph, outcome)
         try:
-            return write(planned, pictures, files, graph, outcome.refs, computed, store), len(computed)
+            return write(planned, pictures, files, graph, outcome.refs, computed, store, notes), len(computed)
         except CorruptArtefact as error:
             if attempt == ATTEMPTS:
                 raise

@@ -10,7 +10,8 @@ from tasks.bones.products import FAST
 from tasks.bones.trajectories import Alignment, align
 from tasks.geometry import rigid
 from tasks.geometry.parallel import for_chunks
-from tasks.values import Motion, Skinning
+from tasks.geometry.skinning import skin
+from tasks.values import Animation, Motion, Skinning
 
 _FRAMES = 8  # frames a thread takes at a time
 _SAMPLE = 1000  # points from which the global motion is taken
@@ -36,6 +37,15 @@ def refit_bones(motion: Motion, skinning: Skinning) -> np.ndarray:
             break
         last = error
     return frame.to_world(offsets).astype(np.float32)
+
+
+def compression_floor(unseen: Motion, skinning: Skinning) -> Animation:
+    """The unseen frames as the bones can show them at best: fitted to the truth itself, weights frozen.
+
+    No method, for it sees what it is to predict: what the bones cannot express, no method on them can predict.
+    """
+    bones = refit_bones(unseen, skinning)
+    return Animation(points=skin(skinning.rest, skinning.weights, bones), bones=bones)
 
 
 def rigid_transforms(points: np.ndarray, canonical: np.ndarray, labels: np.ndarray, sound: np.ndarray) -> np.ndarray:

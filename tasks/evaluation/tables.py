@@ -96,6 +96,7 @@ def build(
     stands_for: Mapping[str, str],
     baselines: Sequence[str],
     notes: Sequence[str],
+    bounds: Sequence[str] = (),
     paper: Paper | None = None,
     paper_table: int = 0,
 ) -> Table:
@@ -105,7 +106,8 @@ def build(
     of the methods ``baselines`` that the column holds; labels: what to call methods, "method/variant"s, datasets and
     "dataset/subject"s, methods in the order wanted; data_status: "paper" or "substitute" by dataset or
     "dataset/subject" (substitute where not named); stands_for: the paper's column that a subject takes the place of,
-    "dataset/subject" to "dataset/subject"; notes: remarks under the table. With ``paper``, the cells of its table
+    "dataset/subject" to "dataset/subject"; notes: remarks under the table; bounds: methods without a
+    rank. With ``paper``, the cells of its table
     ``paper_table`` stand beside ours, and its columns that were not run stand alone.
     """
     measured = _measured(rows, metrics)
@@ -123,6 +125,7 @@ def build(
                 columns += _columns(group, metric, status, _in_order(ours, names), _in_order(theirs, names))
     for (dataset, subject, metric), theirs in printed.items():
         columns.append(_column(_group(dataset, subject), metric, "paper", "printed", _in_order(theirs, names)))
+    columns = [_ranked(c, names, bounds) for c in columns]
     first = {c.group: c.metric for c in reversed(columns)}  # of each subject's metrics
     columns = [_with_gains(c, names, baselines) if c.metric == first[c.group] else c for c in columns]
     called = {**(paper.methods if paper else {}), **(paper.columns if paper else {}), **labels}
@@ -225,8 +228,16 @@ def _column(group: str, metric: str, kind: str, status: str, cells: list[tuple[C
         raise ValueError(f"{group} {metric}: one unit a column, got {sorted(units)}")
     known = [v for v in values if v is not None]
     digits = _printed_digits(known) if kind == "paper" else digits_for(known, metric)
-    ranked = zip(cells, ranks(values, metric_of(metric).better), strict=True)
-    return Column(group, metric, units.pop(), kind, status, digits, tuple(replace(c, rank=r) for (c, _), r in ranked))
+    return Column(group, metric, units.pop(), kind, status, digits, tuple(cell for cell, _ in cells))
+
+
+def _ranked(column: Column, names: list[Row], bounds: Sequence[str]) -> Column:
+    """The column with its best cells marked; differences and rows that are no methods have no rank."""
+    if column.kind == "difference":
+        return column
+    values = [None if n[0] in bounds else c.value for n, c in zip(names, column.cells, strict=True)]
+    marks = ranks(values, metric_of(column.metric).better)
+    return replace(column, cells=tuple(replace(c, rank=r) for c, r in zip(column.cells, marks, strict=True)))
 
 
 def _printed_digits(values: Sequence[float]) -> int:

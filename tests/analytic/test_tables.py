@@ -62,6 +62,11 @@ def test_ranks(values, better, expected):
     assert ranks(values, better) == expected
 
 
+def test_a_bound_is_shown_and_not_ranked():
+    (only,) = table([row("floor", 1.0), row("a", 2.0), row("b", 3.0)], bounds=["floor"]).columns
+    assert [c.rank for c in only.cells] == [0, 1, 2]
+
+
 def test_seeds_become_mean_and_spread_and_rank_by_the_mean():
     made = table([row("a", 1.0), row("a", 4.0, seed=1), row("b", 2.0), row("b", 2.5, seed=1)])
     (only,) = made.columns

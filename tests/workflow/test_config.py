@@ -125,6 +125,24 @@ def test_wildcards_are_one_case_a_file(tmp_path):
         config.expand(["dataset=mesh_sequence", f"dataset.path={tmp_path}/*.obj"])
 
 
+def test_seeds_are_for_methods_with_randomness():
+    cases = config.expand(["sweep.datasets=null", "sweep.methods=[lbs,mlp]", "sweep.seeds=[3,4]"])
+    assert [(c.method, c.seed, c.config["seed"]) for c in cases] == [("lbs", 3, 0), ("mlp", 3, 0), ("mlp", 4, 0)]
+    fixed = config.expand(["sweep.datasets=null", "sweep.methods=[mlp]", "sweep.seeds=[3,4]", "method_seed=7"])
+    assert [c.seed for c in fixed] == [7]
+    plain = config.expand(["sweep.datasets=null", "sweep.methods=[mlp]", "seed=5"])
+    assert [c.seed for c in plain] == [5]
+
+
+def test_braces_name_several_files_and_absent_ones_can_be_done_without(tmp_path):
+    (tmp_path / "a.npz").write_bytes(b"")
+    file = [f"dataset.path='{tmp_path}/{{a,b}}.{{npz,obj}}'", "dataset=mesh_sequence", "sweep.methods=[lbs]"]
+    strict = config.expand(file)
+    assert [c.data.split()[1] for c in strict] == ["a", "a", "b", "b"]
+    assert not any(c.absent for c in strict)
+    assert [c.absent for c in config.expand([*file, "sweep.absent=skip"])] == [False, True, True, True]
+
+
 def test_a_whole_number_may_stand_for_a_number_and_nothing_else_is_converted():
     expected = {"a": float, "b": int | None, "c": list[str]}
     assert schema.check({"a": 1, "b": None, "c": []}, expected) == {"a": 1.0, "b": None, "c": []}

@@ -37,6 +37,12 @@ def load(*, path: str, fps: float, faces: bool, unit: Literal["unit", "m"]) -> M
     return _npz(source, fps=fps, faces=faces, unit=unit)
 
 
+def read_mesh(file: Path) -> tuple[np.ndarray, np.ndarray]:
+    """One OBJ or PLY file: vertices (V, 3) and faces (T, 3) counted from 0."""
+    vertices, topology = _read(file)
+    return vertices, _triangles(file, topology)
+
+
 def _npz(path: Path, *, fps: float, faces: bool, unit: str) -> Motion:
     required = ("vertices", "faces") if faces else ("vertices",)
     data = validate.read_npz(path, required=required, optional=("clip_start", "clip_names", "fps"))

@@ -13,7 +13,7 @@ from tasks.errors import InputError
 
 GROUPS = config.groups()
 FILE = ["dataset=mesh_sequence", "dataset.path=some.npz"]
-NEEDS_PATH = ("mesh_sequence", "rigged_character")
+NEEDS_PATH = ("mesh_sequence", "rigged_character", "vto", "anime")
 
 
 @pytest.mark.parametrize("name", GROUPS["experiment"])

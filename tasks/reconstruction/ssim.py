@@ -84,18 +84,20 @@ def products(first, last, x, y, fields):
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
 def blur_row(field, i, taps, channels, line, out):
     """Row i of a field blurred down and across. line: (W D + 2 HALF D,), zero at its ends."""
-    edge = HALF * channels
+    middle = line[HALF * channels : HALF * channels + len(out)]
+    row = field[i + HALF]
     for k in range(len(out)):
-        line[k + edge] = taps[HALF] * field[i + HALF, k]
+        middle[k] = taps[HALF] * row[k]
     for t in range(HALF):
+        above, below = field[i + t], field[i + 2 * HALF - t]
         for k in range(len(out)):
-            line[k + edge] += taps[t] * (field[i + t, k] + field[i + 2 * HALF - t, k])
+            middle[k] += taps[t] * (above[k] + below[k])
     for k in range(len(out)):
-        out[k] = taps[HALF] * line[k + edge]
+        out[k] = taps[HALF] * middle[k]
     for t in range(HALF):
-        near, far = t * channels, (2 * HALF - t) * channels
+        left, right = line[t * channels :], line[(2 * HALF - t) * channels :]
         for k in range(len(out)):
-            out[k] += taps[t] * (line[k + near] + line[k + far])
+            out[k] += taps[t] * (left[k] + right[k])
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)

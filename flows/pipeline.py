@@ -170,6 +170,7 @@ def plan_pictures(planned: list[Planned], graph: Graph) -> list[Node]:
     """The figures of a report: for every dataset, its last case, and the errors of some methods or variants."""
     drawn = [p.nodes[n] for p in planned for n in ("picture", "frames_picture") if n in p.nodes]
     found = [node for node, _ in drawn]
+    found += _views_pictures([p for p in planned if "rendered" in p.nodes], graph)
     planned = [p for p in planned if "skinning" in p.nodes]  # benchmarks make none
     for data in dict.fromkeys(p.case.data for p in planned):
         cases = [p for p in planned if p.case.data == data]
@@ -179,6 +180,27 @@ def plan_pictures(planned: list[Planned], graph: Graph) -> list[Node]:
         shown = shown if len(shown) <= PANELS else [shown[0], *shown[1 - PANELS :]]
         found += _pictures(shown, graph)
     return found
+
+
+def _views_pictures(planned: list[Planned], graph: Graph) -> list[Node]:
+    """What the same cameras saw and what methods or variants show them, side by side."""
+    seen: dict[Output, list[Planned]] = {}
+    for case in planned:
+        node, output = case.nodes["seen"]
+        seen.setdefault((node.id, output), []).append(case)
+    found = []
+    for cases in seen.values():
+        rendered = {label: p.nodes["rendered"] for label, p in zip(_labels(cases), cases, strict=True)}
+        function, truth = "tasks.evaluation.pictures:views_picture", cases[0].nodes["seen"]
+        inputs = {"truth": truth, "rendered": dict(list(rendered.items())[-PANELS:])}
+        found.append(graph.add("figures", function, {}, outputs=("picture",), case=cases[0].case.data, **inputs))
+    return found
+
+
+def _labels(cases: list[Planned]) -> list[str]:
+    """What to call cases side by side: their methods, or their variants where those are the same."""
+    labels = [p.case.config["animate"]["label"] for p in cases]
+    return labels if len(set(labels)) == len(labels) else [p.case.variant for p in cases]
 
 
 def _pictures(shown: list[Planned], graph: Graph) -> list[Node]:
@@ -196,9 +218,7 @@ def _pictures(shown: list[Planned], graph: Graph) -> list[Node]:
         add("count_picture", "train canonical clusters"),
     ]
     if "animation" in lead.nodes:
-        labels = [p.case.config["animate"]["label"] for p in shown]
-        if len(set(labels)) < len(labels):
-            labels = [p.case.variant for p in shown]
+        labels = _labels(shown)
         animations = {label: p.nodes["animation"] for label, p in zip(labels, shown, strict=True)}
         errors = add("error_picture", "test canonical", {"focus": labels[-1]}, animations=animations)
         pictures.insert(0, errors)

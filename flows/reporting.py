@@ -17,6 +17,8 @@ from flows.store import Ref, Store
 UNSEEN = ("rmse_pct", "rmse", "rmse_coordinate")
 MOTION = ("velocity_rmse", "speed_ratio", "max_error")
 LEFT_OUT = ("rmse_spread", "rmse_left_out", "rmse_left_out_spread")
+VIEWS = ("psnr", "ssim", "flip", "lpips", "ssim_down")
+PATHS = ("path_pct", "path_start_pct")
 RIG = ("bones_rmse_pct", "bones_count", "skeleton_rmse_pct", "joints_count")
 # of each benchmark: what decides, then the numbers behind it by the titles of their tables
 BENCHMARKS = {
@@ -73,7 +75,7 @@ def write(
     settings = planned[0].case.config["report"]
     rows = join([_rows(p, refs, store) for p in planned])
     remarks = dict.fromkeys(f"{a.name}: {note}." for a in (_about(p, refs, store) for p in planned) for note in a.notes)
-    tables = _tables(planned, rows, settings, list(remarks), notes)
+    tables = _tables(planned, rows, refs, settings, list(remarks), notes)
     figures = [(node.cases[0], store.load(refs[node.id], "picture")) for node in pictures]
     figures += _curve(planned, rows, settings["curve"])
     figures += _charts(rows, {p.case.method: p.case.config["animate"]["label"] for p in planned})
@@ -101,7 +103,9 @@ def _rows(case: Planned, refs: dict[str, Ref], store: Store):
     return join([rows_of(store.load(ref, "metrics"), key=ref.key, **labels) for ref in found])
 
 
-def _tables(planned: list[Planned], rows, settings: dict, remarks: list[str], run_notes: list[str]) -> list:
+def _tables(
+    planned: list[Planned], rows, refs: dict[str, Ref], settings: dict, remarks: list[str], run_notes: list[str]
+) -> list:
     from tasks.evaluation.paper import paper_of
     from tasks.evaluation.tables import build
 
@@ -126,11 +130,17 @@ def _tables(planned: list[Planned], rows, settings: dict, remarks: list[str], ru
         return _garment_tables(rows, settings, remarks, common)
     if planned[0].case.config["pipeline"] in BENCHMARKS:
         return _benchmark_tables(planned, rows, settings, common)
+    notes = [*_notes(planned, settings), *run_notes]
+    printed = {"paper": paper, "paper_table": settings["paper_table"]} if settings["paper_table"] else {}
     tables = []
+    if rows["metric"].isin(VIEWS).any():
+        seen = [m for m in VIEWS if rows["metric"].eq(m).any()]
+        fits = _fit_notes(planned, refs)
+        tables.append(build(rows, title=settings["title"], metrics=seen, notes=[*notes, *fits], **printed, **common))
+        notes, printed = [], {}
     if rows["metric"].isin(UNSEEN).any():
-        printed = {"paper": paper, "paper_table": settings["paper_table"]} if settings["paper_table"] else {}
-        notes = [*_notes(planned, settings), *run_notes]
-        tables.append(build(rows, title=settings["title"], metrics=UNSEEN, notes=notes, **printed, **common))
+        title = "Vertex errors of the same results" if tables else settings["title"]
+        tables.append(build(rows, title=title, metrics=UNSEEN, notes=notes, **printed, **common))
         tables += _gain_tables(rows, settings, paper, common)
         tables.append(build(rows, title="Motion of the same results", metrics=MOTION, notes=[], **common))
     if rows["metric"].isin(LEFT_OUT).any():
@@ -139,12 +149,26 @@ def _tables(planned: list[Planned], rows, settings: dict, remarks: list[str], ru
         note += "clips, and the error on the clips that were left out, bones kept. Settings are chosen by the latter."
         plain = common | {"baselines": []}
         tables.append(build(rows, title="One training clip left out", metrics=LEFT_OUT, notes=[note], **plain))
+    if rows["metric"].isin(PATHS).any():
+        tables.append(build(rows, title="Paths of the Gaussians", metrics=PATHS, notes=[], **common))
     shared = common | {"labels": common["labels"] | {planned[-1].case.method: "all methods"}, "baselines": []}
     rig_notes = ["Errors on the training frames that bones and skeleton were fitted to.", *remarks]
-    tables.append(build(lead, title="Bones and skeleton", metrics=RIG, notes=rig_notes, **shared))
+    if rows["metric"].isin(RIG).any():
+        tables.append(build(lead, title="Bones and skeleton", metrics=RIG, notes=rig_notes, **shared))
     if rows["metric"].isin(TRUTH).any():
         tables.append(build(lead, title="Joints against the true rig", metrics=TRUTH, notes=[], **shared))
     return tables
+
+
+def _fit_notes(planned: list[Planned], refs: dict[str, Ref]) -> list[str]:
+    """How long the Gaussians took, which is no metric: it would differ from run to run."""
+    took = {}
+    for case in planned:
+        if "reconstruction" in case.nodes:
+            ref = refs[case.nodes["reconstruction"][0].id]
+            took[f"{case.case.data} {_variant(case)}".strip(), ref.key] = ref.seconds / 60
+    each = ", ".join(f"{name} {minutes:.1f}" for (name, _), minutes in took.items())
+    return [f"Minutes to fit the Gaussians, timed when they were computed: {each}."] if took else []
 
 
 def _garment_tables(rows, settings: dict, remarks: list[str], common: dict) -> list:

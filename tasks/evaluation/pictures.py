@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from tasks.evaluation import figures, render
+from tasks.evaluation.views import views_figure
 from tasks.geometry import kinematics, measure
 from tasks.geometry.skinning import skin
-from tasks.values import Animation, Canonical, Clusters, Motion, Parts, Picture, Poses, Skeleton, Skinning
+from tasks.values import Animation, Canonical, Capture, Clusters, Motion, Parts, Picture, Poses, Skeleton, Skinning
 
 
 def error_picture(test: Motion, canonical: Canonical, animations: dict[str, Animation], *, focus: str) -> Picture:
@@ -54,6 +55,11 @@ def garment_picture(body: Motion, poses: dict[str, Poses], cloth: dict[str, Moti
     first = cloth[clips[0]]
     pixels = figures.worn_figure(panels, body.faces, first.faces)
     return Picture("frames", f"{first.name}: the middle frame of every clip", _png(pixels))
+
+
+def views_picture(truth: Capture, rendered: dict[str, Capture]) -> Picture:
+    """What test cameras saw and what is rendered for them."""
+    return Picture("views", f"{truth.name}: held-out views and their renderings", _png(views_figure(truth, rendered)))
 
 
 def _png(pixels: np.ndarray) -> np.ndarray:

@@ -107,6 +107,7 @@ def _tables(
     planned: list[Planned], rows, refs: dict[str, Ref], settings: dict, remarks: list[str], run_notes: list[str]
 ) -> list:
     from tasks.evaluation.paper import paper_of
+    from tasks.evaluation.rows import with_means
     from tasks.evaluation.tables import build
 
     paper = paper_of(OmegaConf.to_container(OmegaConf.load(CONF / "paper" / "gaussianimate.yaml")))
@@ -136,7 +137,9 @@ def _tables(
     if rows["metric"].isin(VIEWS).any():
         seen = [m for m in VIEWS if rows["metric"].eq(m).any()]
         fits = _fit_notes(planned, refs)
-        tables.append(build(rows, title=settings["title"], metrics=seen, notes=[*notes, *fits], **printed, **common))
+        tables.append(
+            build(with_means(rows), title=settings["title"], metrics=seen, notes=[*notes, *fits], **printed, **common)
+        )
         notes, printed = [], {}
     if rows["metric"].isin(UNSEEN).any():
         title = "Vertex errors of the same results" if tables else settings["title"]
@@ -150,13 +153,13 @@ def _tables(
         plain = common | {"baselines": []}
         tables.append(build(rows, title="One training clip left out", metrics=LEFT_OUT, notes=[note], **plain))
     if rows["metric"].isin(PATHS).any():
-        tables.append(build(rows, title="Paths of the Gaussians", metrics=PATHS, notes=[], **common))
+        tables.append(build(with_means(rows), title="Paths of the Gaussians", metrics=PATHS, notes=[], **common))
     shared = common | {"labels": common["labels"] | {planned[-1].case.method: "all methods"}, "baselines": []}
     rig_notes = ["Errors on the training frames that bones and skeleton were fitted to.", *remarks]
     if rows["metric"].isin(RIG).any():
         tables.append(build(lead, title="Bones and skeleton", metrics=RIG, notes=rig_notes, **shared))
     if rows["metric"].isin(TRUTH).any():
-        tables.append(build(lead, title="Joints against the true rig", metrics=TRUTH, notes=[], **shared))
+        tables.append(build(with_means(lead), title="Joints against the true rig", metrics=TRUTH, notes=[], **shared))
     return tables
 
 

@@ -27,9 +27,9 @@ def scene_motion(
     """The frames of a motion that a scene shows, and the truth that what is fitted to it is held against.
 
     clip: one clip by its name, null for all. frames: how many, null for all; first: the first ones; even: spread
-    evenly, first and last among them; resample: that many, also more than there are, each clip by cubic interpolation
-    over time (only where no skeleton comes with the data). Raises InputError for an unknown clip and numbers out of
-    range.
+    evenly, first and last among them, both all where there are fewer; resample: that many, also more than there are,
+    each clip by cubic interpolation over time (only where no skeleton comes with the data). Raises InputError for an
+    unknown clip and numbers out of range.
 
     Where the data has no rest shape, its first frame becomes one: colours are painted on it, whichever frames are
     rendered later.
@@ -40,15 +40,14 @@ def scene_motion(
         if clip not in motion.clip_names:
             raise InputError("scene.clip", expected=f"one of {', '.join(motion.clip_names)}", found=repr(clip))
         motion = motion.take_clips([motion.clip_names.index(clip)])
-    if frames is None or (frames == motion.frames and choose != "resample"):
+    if frames is None:
         return motion
     if frames < 2:
         raise InputError("scene.frames", expected="2 or more, or null for all", found=str(frames))
     if choose == "resample":
-        return _resampled(motion, frames)
-    if frames > motion.frames:
-        do = "set it to null, or scene.choose=resample"
-        raise InputError("scene.frames", expected=f"at most the {motion.frames} there are", found=str(frames), do=do)
+        return motion if frames == motion.frames else _resampled(motion, frames)
+    if frames >= motion.frames:
+        return motion
     if choose == "first":
         index = np.arange(frames)
     else:

@@ -41,6 +41,21 @@ def join(pieces: list[pd.DataFrame]) -> pd.DataFrame:
     return pd.concat(pieces, ignore_index=True) if pieces else pd.DataFrame(columns=list(COLUMNS))
 
 
+def with_means(rows: pd.DataFrame) -> pd.DataFrame:
+    """The rows, and as a column of its own the mean over the subjects where every one has the metric.
+
+    For numbers that mean the same on every subject (percent, ratio, decibel); nothing is added for a single subject.
+    """
+    everyone = rows.groupby(["dataset", "subject"]).ngroups
+    keys = ["method", "variant", "metric", "unit", "seed"]
+    groups = rows.groupby(keys, sort=False)
+    means = groups["value"].mean()[groups.size() == everyone].reset_index()
+    if everyone < 2 or means.empty:
+        return rows
+    means = means.assign(experiment=rows["experiment"].iloc[0], dataset="mean", subject="", key="")
+    return join([rows, means[list(COLUMNS)]])
+
+
 def to_csv(rows: pd.DataFrame) -> str:
     """The text of metrics.csv. Floats are written with as few digits as give back the same bits, so equal rows give
     equal bytes. Raises ValueError on a value that is not finite."""

@@ -7,6 +7,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import yaml
 from rich.console import Console
@@ -15,7 +16,7 @@ from tasks.errors import InputError
 from tasks.evaluation import typeset
 from tasks.evaluation.metrics import METRICS
 from tasks.evaluation.paper import paper_of
-from tasks.evaluation.rows import join, rows_of
+from tasks.evaluation.rows import join, rows_of, with_means
 from tasks.evaluation.tables import Cell, Table, build, digits_for, ranks
 from tasks.values import Metrics
 
@@ -277,3 +278,16 @@ def test_footnotes_are_numbered_in_reading_order(full):
     assert len(full.footnotes) == len(set(full.footnotes)) == 4
     assert typeset.cell_text(full.columns[0], Cell()) == ("–", "")
     assert typeset.cell_text(full.columns[0], Cell(note="lost")) == ("?", "")
+
+
+def test_means_are_of_what_every_subject_has():
+    def case(subject: str, method: str, value: float) -> pd.DataFrame:
+        metrics = Metrics(("psnr",), ("dB",), np.array([value]))
+        labels = {"experiment": "e", "dataset": "d", "variant": "", "seed": 0, "key": "k"}
+        return rows_of(metrics, subject=subject, method=method, **labels)
+
+    rows = join([case("a", "ours", 30.0), case("b", "ours", 20.0), case("a", "other", 10.0)])
+    found = with_means(rows)
+    means = found[found["dataset"] == "mean"]
+    assert means[["method", "value"]].values.tolist() == [["ours", 25.0]]
+    assert with_means(rows[rows["subject"] == "a"])["dataset"].eq("d").all()

@@ -13,7 +13,7 @@ from tasks.errors import InputError
 
 GROUPS = config.groups()
 FILE = ["dataset=mesh_sequence", "dataset.path=some.npz"]
-NEEDS_PATH = ("mesh_sequence", "rigged_character", "vto", "anime")
+NEEDS_PATH = ("mesh_sequence", "rigged_character", "vto", "anime", "dnerf", "multiview")
 
 
 @pytest.mark.parametrize("name", GROUPS["experiment"])

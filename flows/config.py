@@ -24,13 +24,14 @@ from omegaconf.errors import OmegaConfBaseException
 
 from flows import schema
 from flows.source import ROOT, signature
-from tasks.errors import InputError
+from tasks.errors import InputError, NotGiven
 
 CONF = ROOT / "conf"
 NO_ABLATION = "none"
 ADDED = ("experiment", "ablation")  # groups that the config does not choose from by itself: +GROUP=CHOICE
-SWEPT = ("datasets", "methods", "ablations")
-SWEEP = {**dict.fromkeys(SWEPT, list[str] | None), "seeds": list[int] | None, "absent": Literal["fail", "skip"]}
+SWEPT = ("datasets", "methods", "ablations")  # the axes of an experiment's grid
+SWEEP = dict.fromkeys(("experiments", *SWEPT), list[str] | None)
+SWEEP |= {"seeds": list[int] | None, "absent": Literal["fail", "skip"]}
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,15 @@ class Case:
         return self.dataset if stem in self.dataset else f"{self.dataset} {stem}"
 
 
+@dataclass(frozen=True)
+class Missing:
+    """What an experiment goes without: the dataset or case, why, and the paper's column that it would stand for."""
+
+    what: str
+    why: str
+    stands_for: str | None = None
+
+
 def groups() -> dict[str, list[str]]:
     """Config groups and their choices, read from the folder."""
     return {
@@ -79,23 +89,51 @@ def headline(group: str, choice: str) -> str:
 
 def expand(overrides: list[str], multirun: bool = False) -> list[Case]:
     """All cases of a command line. Raises InputError for a wrong key, type or choice."""
-    parsed = [_parse(text) for text in overrides]
+    used: set[str] = set()
+    cases = expand_some(overrides, multirun, used)
+    check_used(overrides, used, cases)
+    return cases
+
+
+def expand_some(
+    overrides: list[str], multirun: bool, used: set[str], missing: list[Missing] | None = None
+) -> list[Case]:
+    """As :func:`expand`, for one experiment among several: ``used`` collects the overrides that set something; with
+    ``missing``, a case whose data is not there is put on that list instead of being an error."""
+    parsed = [parse(text) for text in overrides]
     sweeps = [o for o in parsed if o.is_sweep_override()]
     if sweeps and not multirun:
         name = sweeps[0].key_or_group
         raise InputError(name, expected="one value", found=sweeps[0].input_line, do="add -m to run all of them")
-    axes = [[_parse(f"{_plus(o)}{o.key_or_group}={v}") for v in o.sweep_string_iterator()] for o in sweeps]
+    axes = [[parse(f"{_plus(o)}{o.key_or_group}={v}") for v in o.sweep_string_iterator()] for o in sweeps]
     fixed = [o for o in parsed if not o.is_sweep_override()]
     compose_once = cache(_compose)
-    used: set[str] = set()
-    cases = [c for point in itertools.product(*axes) for c in _sweep([*fixed, *point], list(point), compose_once, used)]
-    for override in (*fixed, *itertools.chain(*axes)):
-        if override.input_line not in used:
-            raise _nowhere(override, cases)
+    cases: list[Case] = []
+    for point in itertools.product(*axes):
+        cases += _sweep([*fixed, *point], list(point), compose_once, used, missing)
+    used |= {o.input_line for o, axis in zip(sweeps, axes, strict=True) if all(v.input_line in used for v in axis)}
     return list({(c.dataset, c.method, c.variant, str(c.config)): c for c in cases}.values())
 
 
-def _sweep(overrides: list[Override], point: list[Override], compose_once, used: set[str]) -> Iterator[Case]:
+def whole(overrides: list[str]) -> dict:
+    """The config of a run itself: its experiment and runner, and the overrides that are not about a dataset or method;
+    plain values, not checked."""
+    parsed = [parse(text) for text in overrides]
+    choices = {o.key_or_group: str(o.value()) for o in parsed if o.key_or_group in ("experiment", "runner")}
+    values = [o for o in parsed if o.key_or_group not in groups() and not o.is_sweep_override()]
+    return _plain(_set(_compose(_group_overrides(choices)), values)[0])
+
+
+def check_used(overrides: list[str], used: set[str], cases: list[Case]) -> None:
+    """Raises InputError for the first override that set nothing in any case."""
+    for override in map(parse, overrides):
+        if override.input_line not in used:
+            raise _nowhere(override, cases)
+
+
+def _sweep(
+    overrides: list[Override], point: list[Override], compose_once, used: set[str], missing: list[Missing] | None
+) -> Iterator[Case]:
     """The cases of one point of a multirun: the experiment's datasets x methods x ablations.
 
     A key that only some of the methods or datasets have is set in those; used collects what was set anywhere.
@@ -115,10 +153,17 @@ def _sweep(overrides: list[Override], point: list[Override], compose_once, used:
         composed, set_here = _set(compose_once(_group_overrides(chosen)), values)
         used |= set_here
         config = _plain(composed)
-        config = schema.check(config, schema.schema(config, SWEEP))
         variant = ",".join(filter(None, [ablation, label])) or NO_ABLATION
-        name = chosen["dataset"] or config["dataset"]["kind"]
-        for node, seed in itertools.product(_files(config["dataset"]), _seeds(config)):
+        name = chosen["dataset"] or config["dataset"].get("kind")
+        try:
+            config = schema.check(config, schema.schema(config, SWEEP))
+            nodes = _files(config["dataset"])
+        except NotGiven as error:
+            if missing is None:
+                raise
+            missing.append(Missing(name, str(error), config["dataset"].get("stands_for")))
+            continue
+        for node, seed in itertools.product(nodes, _seeds(config)):
             yield Case(name, config["animate"]["name"], variant, config | {"dataset": node, "method_seed": seed})
 
 
@@ -139,7 +184,7 @@ def _files(dataset: dict) -> list[dict]:
     for one in _alternatives(path):
         matches = sorted(glob(str(Path(one).expanduser()))) if has_magic(one) else [one]
         if not matches:
-            raise InputError("dataset.path", expected="a file or folder", found=f"nothing that matches {one}")
+            raise NotGiven("dataset.path", expected="a file or folder", found=f"nothing that matches {one}")
         found += matches
     return [dataset | {"path": one} for one in found]
 
@@ -186,7 +231,8 @@ def _nowhere(override: Override, cases: list[Case]) -> InputError:
     return InputError(override.key_or_group, expected="a key of the config", found=override.input_line)
 
 
-def _parse(text: str) -> Override:
+def parse(text: str) -> Override:
+    """An override of the command line. Raises InputError where it is none, or names no choice of its group."""
     known = groups()
     try:
         override = OverridesParser.create().parse_override(text)

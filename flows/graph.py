@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from flows import source
@@ -34,6 +35,17 @@ class Node:
             raise KeyError(f"{self.stage} has the outputs {', '.join(self.outputs)}, not {output}")
         return self, output
 
+    def walk(self) -> Iterator[Node]:
+        """The node and all that it depends on, each once."""
+        seen: dict[str, Node] = {}
+        pending = [self]
+        while pending:
+            node = pending.pop()
+            if node.id not in seen:
+                seen[node.id] = node
+                pending += node.upstream()
+        yield from seen.values()
+
     def upstream(self) -> list[Node]:
         """The nodes whose artefacts this one reads."""
         found: list[Node] = []
@@ -46,9 +58,10 @@ class Node:
 class Graph:
     """Nodes by identity, in an order in which every node stands after what it needs."""
 
-    def __init__(self) -> None:
+    def __init__(self, files: dict[str, str] | None = None) -> None:
+        """files: digests of input files by path, to be shared by graphs that read the same."""
         self.nodes: dict[str, Node] = {}
-        self._files: dict[str, str] = {}  # an input shared by many cases is read once
+        self._files = {} if files is None else files  # an input shared by many cases is read once
 
     def add(
         self,
@@ -76,6 +89,16 @@ class Graph:
         if path not in self._files:
             self._files[path] = digest_of_files(path)
         return self._files[path]
+
+
+def union(graphs: list[Graph]) -> Graph:
+    """All nodes of several graphs; equal ones become one that names the cases of all."""
+    whole = Graph()
+    for graph in graphs:
+        for node in graph.nodes.values():
+            one = whole.nodes.setdefault(node.id, replace(node, cases=[]))
+            one.cases += [case for case in node.cases if case not in one.cases]
+    return whole
 
 
 def digest_of_files(path: str) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import platform
 import re
 import subprocess
-import sys
 from importlib.metadata import PackageNotFoundError, requires, version
 
 from flows.config import Case
@@ -16,10 +15,12 @@ from flows.store import Ref
 PACKAGE = "skelebones"
 
 
-def provenance(cases: list[Case], graph: Graph, refs: dict[str, Ref], computed: set[str]) -> dict:
-    """A report's provenance as plain JSON."""
+def provenance(
+    arguments: tuple[str, ...], cases: list[Case], graph: Graph, refs: dict[str, Ref], computed: set[str]
+) -> dict:
+    """A report's provenance as plain JSON. arguments: of ``flows.run``, with which this report is made again."""
     return {
-        "command": ["python", "-m", "flows.run", *(_without_folders(a) for a in sys.argv[1:])],
+        "command": command(arguments).split(" "),
         "git": git_state(),
         "versions": versions(),
         "machine": {"system": platform.platform(), "python": platform.python_version(), "cpu": platform.machine()},
@@ -34,6 +35,7 @@ def provenance(cases: list[Case], graph: Graph, refs: dict[str, Ref], computed: 
                 "stage": node.stage,
                 "cases": node.cases,
                 "key": refs[node.id].key,
+                "source": node.source,
                 "outputs": refs[node.id].outputs,
                 "how": "computed" if node.id in computed else "cached",
                 "seconds": refs[node.id].seconds,
@@ -45,9 +47,15 @@ def provenance(cases: list[Case], graph: Graph, refs: dict[str, Ref], computed: 
     }
 
 
+def command(arguments: tuple[str, ...]) -> str:
+    """The command line that makes a report's numbers, without what belongs to one machine."""
+    kept = [a for a in arguments if not a.startswith(("store", "runner", "report.path", "plan"))]
+    return " ".join(["python -m flows.run", *(_without_folders(a) for a in kept)])
+
+
 def portable(config: dict) -> dict:
     """A config without what belongs to one machine: the store, the runner, the folders of inputs and reports."""
-    kept = {name: value for name, value in config.items() if name not in ("store", "runner", "data_root")}
+    kept = {name: value for name, value in config.items() if name not in ("store", "runner", "data_root", "plan")}
     if isinstance(kept["dataset"].get("path"), str):
         kept["dataset"] = kept["dataset"] | {"path": _without_folders(kept["dataset"]["path"])}
     kept["report"] = {name: value for name, value in kept["report"].items() if name != "path"}

@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from omegaconf import OmegaConf
 
-from flows.config import CONF, NO_ABLATION
-from flows.graph import Graph, Node
-from flows.pipeline import Output, Planned
-from flows.provenance import provenance
+from flows.config import CONF, NO_ABLATION, Case
+from flows.pipeline import Planned
+from flows.provenance import command, provenance
 from flows.store import Ref, Store
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from flows.batch import Batch, Experiment, Work
+    from tasks.evaluation.tables import Table
+    from tasks.values import Picture
 
 UNSEEN = ("rmse_pct", "rmse", "rmse_coordinate")
 MOTION = ("velocity_rmse", "speed_ratio", "max_error")
@@ -51,40 +58,104 @@ TRUTH = ("joint_f1", "joint_f1_fine", "link_f1", "j2j_pct", "j2b_pct", "b2b_pct"
 
 @dataclass(frozen=True)
 class Report:
-    """A written report. tables: Markdown; shown: the same for the terminal."""
+    """A written report; without a folder, of an experiment that had nothing to write. figures: (subject, picture)."""
 
-    folder: Path
-    tables: str
-    shown: list
+    experiment: Experiment
+    folder: Path | None = None
+    rows: pd.DataFrame | None = None
+    tables: list[Table] = field(default_factory=list)
+    figures: list[tuple[str, Picture]] = field(default_factory=list)
+    cases: list[Case] = field(default_factory=list)
+    provenance: dict = field(default_factory=dict)
+
+    @property
+    def markdown(self) -> str:
+        """The tables for Prefect's page."""
+        from tasks.evaluation import typeset
+
+        return "\n".join(typeset.markdown(t) for t in self.tables)
+
+    @property
+    def shown(self) -> list:
+        """The tables for the terminal."""
+        from tasks.evaluation import typeset
+
+        return [typeset.terminal(t) for t in self.tables]
+
+    @property
+    def line(self) -> str:
+        """The report in a line, for the terminal."""
+        missing = f"not run: {'; '.join(f'{m.what}: {m.why}' for m in self.experiment.missing)}"
+        said = [f"report in {self.folder}"] if self.folder else []
+        return f"{self.experiment.name}: {', '.join([*said, *([missing] if self.experiment.missing else [])])}"
 
 
-def write(
-    planned: list[Planned],
-    pictures: list[Node],
-    files: list[Output],
-    graph: Graph,
-    refs: dict[str, Ref],
-    computed: set[str],
-    store: Store,
-    notes: list[str],
-) -> Report:
-    """Writes a report's folder and returns what to show of it. notes: remarks on the run, for the first table."""
-    from tasks.evaluation import report, typeset
+def write(work: Work, refs: dict[str, Ref], computed: set[str], store: Store) -> Report:
+    """Writes a report's folder."""
+    from tasks.evaluation import report
     from tasks.evaluation.rows import join
 
-    settings = planned[0].case.config["report"]
+    planned, cases = work.planned, [p.case for p in work.planned]
+    settings = cases[0].config["report"]
     rows = join([_rows(p, refs, store) for p in planned])
-    remarks = dict.fromkeys(f"{a.name}: {note}." for a in (_about(p, refs, store) for p in planned) for note in a.notes)
-    tables = _tables(planned, rows, refs, settings, list(remarks), notes)
-    figures = [(node.cases[0], store.load(refs[node.id], "picture")) for node in pictures]
-    figures += _curve(planned, rows, settings["curve"])
-    figures += _charts(rows, {p.case.method: p.case.config["animate"]["label"] for p in planned})
+    about = [_about(p, refs, store) for p in planned]
+    remarks = list(dict.fromkeys(f"{a.name}: {note}." for a in about for note in a.notes))
+    said = [f"Not run: {m.what}, {m.why}." for m in work.experiment.missing] + _fit_notes(planned, refs)
+    tables = tables_of(cases, rows, remarks, said)
+    figures = [(node.cases[0], store.load(refs[node.id], "picture")) for node in work.pictures]
+    figures += _curve(cases, rows, settings["curve"])
+    figures += _charts(rows, labels_of(cases))
     folder = Path(settings["path"]).expanduser() / settings["name"]
-    origin = provenance([p.case for p in planned], graph, refs, computed)
-    brought = [store.load(refs[node.id], output) for node, output in files]
+    origin = provenance(work.experiment.arguments, cases, work.graph, refs, computed)
+    origin |= {"remarks": remarks, "said": said}
+    brought = [store.load(refs[node.id], output) for node, output in work.files]
     report.write_report(folder, rows, tables, figures, origin, brought)
-    markdown = "\n".join(typeset.markdown(t) for t in tables)
-    return Report(folder, markdown, [typeset.terminal(t) for t in tables])
+    return Report(work.experiment, folder, rows, tables, figures, cases, origin)
+
+
+def made_again(folder: Path) -> dict[str, bytes]:
+    """The files of a report but its provenance, made anew from its metrics.csv, provenance.json and figures.
+
+    Raises InputError where one of them cannot be read.
+    """
+    from tasks.evaluation import report
+    from tasks.evaluation.rows import from_csv
+
+    origin = report.read_provenance(folder)
+    rows = from_csv((folder / "metrics.csv").read_text("utf-8"), str(folder / "metrics.csv"))
+    tables = tables_of([Case(**case) for case in origin["cases"]], rows, origin["remarks"], origin["said"])
+    return report.contents(folder.name, rows, tables, report.read_figures(folder, origin), origin)
+
+
+def write_index(batch: Batch, reports: list[Report]) -> Path:
+    """Writes the page that holds all experiments of a run, beside their folders. Returns its path."""
+    from tasks.evaluation import coverage, index, report
+
+    by_name = {r.experiment.name: r for r in reports}
+    every = [by_name.get(e.name, Report(e)) for e in batch.experiments]
+    paper = _paper()
+    measured = [
+        coverage.Measured(r.cases[0].config["report"]["paper_table"], r.rows, *_places(r.cases, r.rows))
+        for r in every
+        if r.folder and r.cases[0].config["report"]["paper_table"]
+    ]
+    absent = {m.stands_for: m.why for r in every for m in r.experiment.missing if m.stands_for}
+    sections = [
+        index.Section(
+            name=r.experiment.name,
+            title=r.experiment.title,
+            command=command(r.experiment.arguments),
+            tables=r.tables,
+            figures=[picture for _, picture in r.figures],
+            missing=[(m.what, m.why) for m in r.experiment.missing],
+        )
+        for r in every
+    ]
+    folder = Path(batch.config["report"]["path"]).expanduser()
+    origin = next((r.provenance for r in every if r.folder), {})
+    page = index.html(batch.config["report"]["title"], sections, coverage.cover(paper, measured, absent), origin)
+    report.write_page(folder / "index.html", page)
+    return folder / "index.html"
 
 
 def _rows(case: Planned, refs: dict[str, Ref], store: Store):
@@ -96,50 +167,40 @@ def _rows(case: Planned, refs: dict[str, Ref], store: Store):
         "dataset": case.case.dataset,
         "subject": _subject(case, refs, store),
         "method": case.case.method,
-        "variant": _variant(case),
+        "variant": _variant(case.case),
         "seed": case.case.seed,
     }
     found = [refs[node.id] for node in case.metrics]
     return join([rows_of(store.load(ref, "metrics"), key=ref.key, **labels) for ref in found])
 
 
-def _tables(
-    planned: list[Planned], rows, refs: dict[str, Ref], settings: dict, remarks: list[str], run_notes: list[str]
-) -> list:
-    from tasks.evaluation.paper import paper_of
+def tables_of(cases: list[Case], rows, remarks: list[str], said: list[str]) -> list:
+    """The tables of an experiment, from its cases' configs and the rows of its metrics.csv. remarks: on the data; said:
+    of the run."""
     from tasks.evaluation.rows import with_means
     from tasks.evaluation.tables import build
 
-    paper = paper_of(OmegaConf.to_container(OmegaConf.load(CONF / "paper" / "gaussianimate.yaml")))
-    datasets = {p.case.dataset: p.case.config["dataset"] for p in planned}
+    paper, settings = _paper(), cases[0].config["report"]
+    data_status, stands_for = _places(cases, rows)
     # bones and skeleton do not depend on the method, and seldom on the variant: one row for each that differs
-    lead = rows[rows["method"] == planned[-1].case.method].drop_duplicates(
-        ["dataset", "subject", "metric", "key", "seed"]
-    )
+    lead = rows[rows["method"] == cases[-1].method].drop_duplicates(["dataset", "subject", "metric", "key", "seed"])
     common = {
-        "labels": {p.case.method: p.case.config["animate"]["label"] for p in planned},
-        "data_status": {name: node["status"] for name, node in datasets.items()},
-        "stands_for": {
-            f"{dataset}/{subject}": datasets[dataset]["stands_for"]
-            for dataset, subject in rows[["dataset", "subject"]].drop_duplicates().itertuples(index=False)
-            if datasets[dataset]["stands_for"]
-        },
+        "labels": labels_of(cases),
+        "data_status": data_status,
+        "stands_for": stands_for,
         "baselines": settings["baselines"],
         "bounds": settings["bounds"],
     }
-    if planned[0].case.config["pipeline"] == "make_garments":
+    if cases[0].config["pipeline"] == "make_garments":
         return _garment_tables(rows, settings, remarks, common)
-    if planned[0].case.config["pipeline"] in BENCHMARKS:
-        return _benchmark_tables(planned, rows, settings, common)
-    notes = [*_notes(planned, settings), *run_notes]
+    if cases[0].config["pipeline"] in BENCHMARKS:
+        return _benchmark_tables(cases, rows, settings, common)
+    notes = [*_notes(cases, settings), *said]
     printed = {"paper": paper, "paper_table": settings["paper_table"]} if settings["paper_table"] else {}
     tables = []
     if rows["metric"].isin(VIEWS).any():
         seen = [m for m in VIEWS if rows["metric"].eq(m).any()]
-        fits = _fit_notes(planned, refs)
-        tables.append(
-            build(with_means(rows), title=settings["title"], metrics=seen, notes=[*notes, *fits], **printed, **common)
-        )
+        tables.append(build(with_means(rows), title=settings["title"], metrics=seen, notes=notes, **printed, **common))
         notes, printed = [], {}
     if rows["metric"].isin(UNSEEN).any():
         title = "Vertex errors of the same results" if tables else settings["title"]
@@ -147,14 +208,14 @@ def _tables(
         tables += _gain_tables(rows, settings, paper, common)
         tables.append(build(rows, title="Motion of the same results", metrics=MOTION, notes=[], **common))
     if rows["metric"].isin(LEFT_OUT).any():
-        runs = planned[0].case.config["evaluate"]["left_out"]
+        runs = cases[0].config["evaluate"]["left_out"]
         note = f"Trained {runs} times, each time without one training clip: how far that moves the error on the unseen "
         note += "clips, and the error on the clips that were left out, bones kept. Settings are chosen by the latter."
         plain = common | {"baselines": []}
         tables.append(build(rows, title="One training clip left out", metrics=LEFT_OUT, notes=[note], **plain))
     if rows["metric"].isin(PATHS).any():
         tables.append(build(with_means(rows), title="Paths of the Gaussians", metrics=PATHS, notes=[], **common))
-    shared = common | {"labels": common["labels"] | {planned[-1].case.method: "all methods"}, "baselines": []}
+    shared = common | {"labels": common["labels"] | {cases[-1].method: "all methods"}, "baselines": []}
     rig_notes = ["Errors on the training frames that bones and skeleton were fitted to.", *remarks]
     if rows["metric"].isin(RIG).any():
         tables.append(build(lead, title="Bones and skeleton", metrics=RIG, notes=rig_notes, **shared))
@@ -169,7 +230,7 @@ def _fit_notes(planned: list[Planned], refs: dict[str, Ref]) -> list[str]:
     for case in planned:
         if "reconstruction" in case.nodes:
             ref = refs[case.nodes["reconstruction"][0].id]
-            took[f"{case.case.data} {_variant(case)}".strip(), ref.key] = ref.seconds / 60
+            took[f"{case.case.data} {_variant(case.case)}".strip(), ref.key] = ref.seconds / 60
     each = ", ".join(f"{name} {minutes:.1f}" for (name, _), minutes in took.items())
     return [f"Minutes to fit the Gaussians, timed when they were computed: {each}."] if took else []
 
@@ -205,11 +266,28 @@ def _gain_tables(rows, settings: dict, paper, common: dict) -> list:
     return tables
 
 
-def _benchmark_tables(planned: list[Planned], rows, settings: dict, common: dict) -> list:
+def _paper():
+    from tasks.evaluation.paper import paper_of
+
+    return paper_of(OmegaConf.to_container(OmegaConf.load(CONF / "paper" / "gaussianimate.yaml")))
+
+
+def _places(cases: list[Case], rows) -> tuple[dict[str, str], dict[str, str]]:
+    """By dataset, whether it is the paper's; by dataset and subject, the paper's column that it stands for."""
+    datasets = {c.dataset: c.config["dataset"] for c in cases}
+    stands_for = {
+        f"{dataset}/{subject}": datasets[dataset]["stands_for"]
+        for dataset, subject in rows[["dataset", "subject"]].drop_duplicates().itertuples(index=False)
+        if datasets[dataset]["stands_for"]
+    }
+    return {name: node["status"] for name, node in datasets.items()}, stands_for
+
+
+def _benchmark_tables(cases: list[Case], rows, settings: dict, common: dict) -> list:
     """What decides first, then the numbers behind it; rows are subjects and columns peers, for few are compared."""
     from tasks.evaluation.tables import build, unranked
 
-    config = planned[0].case.config
+    config = cases[0].config
     first, others = BENCHMARKS[config["pipeline"]]
     repeats = config["benchmark"]["repeats"]
     runs = f"{repeats} runs of ours and {config['benchmark'].get('peer_repeats', repeats)} of the peer"
@@ -231,7 +309,7 @@ def _benchmark_tables(planned: list[Planned], rows, settings: dict, common: dict
     return [table(settings["title"], first, notes), *(table(t, metrics, []) for t, metrics in others.items())]
 
 
-def _curve(planned: list[Planned], rows, curve: list[str] | None) -> list:
+def _curve(cases: list[Case], rows, curve: list[str] | None) -> list:
     """A metric against a key of the config, a line for every dataset."""
     from tasks.evaluation.charts import curve_chart
     from tasks.values import Picture
@@ -239,7 +317,7 @@ def _curve(planned: list[Planned], rows, curve: list[str] | None) -> list:
     if not curve:
         return []
     key, metric = curve
-    where = {_variant(p): _at(p.case.config, key) for p in planned}
+    where = {_variant(c): _at(c.config, key) for c in cases}
     chart = curve_chart(rows, metric=metric, where=where, label=key)
     return [("all", Picture("curve", f"{metric} against {key}", None, chart))]
 
@@ -272,20 +350,25 @@ def _charts(rows, labels: dict[str, str]) -> list:
     return drawn
 
 
-def _notes(planned: list[Planned], settings: dict) -> list[str]:
+def labels_of(cases: list[Case]) -> dict[str, str]:
+    """What to call the methods."""
+    return {c.method: c.config["animate"]["label"] for c in cases}
+
+
+def _notes(cases: list[Case], settings: dict) -> list[str]:
     notes = []
-    if any(p.case.config["skeleton"]["kind"] == "curve" for p in planned):
+    if any(c.config["skeleton"]["kind"] == "curve" for c in cases):
         notes.append(
             "Query poses of unseen clips come from inverse kinematics on the unseen geometry, "
             "as the paper does where the data brings no skeleton."
         )
-    if all(p.case.config["dataset"]["status"] == "substitute" for p in planned):
+    if all(c.config["dataset"]["status"] == "substitute" for c in cases):
         notes.append("No column is the paper's data: every one is a substitute, its numbers are not the paper's task.")
     return [*notes, settings["note"]] if settings["note"] else notes
 
 
-def _variant(case: Planned) -> str:
-    return "" if case.case.variant == NO_ABLATION else case.case.variant
+def _variant(case: Case) -> str:
+    return "" if case.variant == NO_ABLATION else case.variant
 
 
 def _about(case: Planned, refs: dict[str, Ref], store: Store):

@@ -13,12 +13,14 @@ import sys
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 from flows import config
+from flows.batch import batch
 from tasks.errors import InputError
 
 EXAMPLES = """\
 examples:
   python -m flows.run                                             the experiment quick, on the embedded creatures
   python -m flows.run +experiment=table3 dataset=mesh_sequence dataset.path=FILE.npz
+  python -m flows.run +experiment=paper                           every table and ablation, and one page that holds them
   python -m flows.run -m bones.max_bones=10,20,30                 one table with a row for every value
   python -m flows.run +ablation=k_1 method=partmm                 one line of the config changed
   python -m flows.run --cfg +experiment=table3                    print the config and run nothing
@@ -38,13 +40,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--cfg", action="store_true", help="print the resolved config of every case and stop")
     known = parser.parse_args(arguments)
     try:
-        cases = config.expand(known.overrides, known.multirun)
+        run = batch(known.overrides, known.multirun)
         if known.cfg:
+            cases = [case for experiment in run.experiments for case in experiment.cases]
             print("---\n".join(f"# {c.dataset} {c.method} {c.variant}\n{config.to_yaml(c)}" for c in cases))
             return 0
-        from flows.sweep import run_sweep
+        from flows.sweep import run_batch
 
-        run_sweep(cases)
+        run_batch(run)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -12,7 +12,7 @@ import typing
 from typing import Literal
 
 from flows.source import choices, signature
-from tasks.errors import InputError
+from tasks.errors import InputError, NotGiven
 
 CLUSTER = "tasks.bones.clustering:cluster"
 SSDR = "tasks.bones.ssdr:ssdr"
@@ -125,6 +125,7 @@ def schema(config: dict, sweep: dict[str, object]) -> dict[str, object]:
     bones |= settings(BONES.get(config["bones"].get("kind"), SSDR))
     return {
         "seed": int,
+        "plan": bool,
         "method_seed": int | None,
         "data_root": str,
         "pipeline": Literal[PIPELINES],
@@ -237,7 +238,7 @@ def _typed(value: object, kind: object, path: str) -> object:
     """The value as the type; a whole number may stand for a float, nothing else is converted."""
     origin = typing.get_origin(kind)
     if value == "???":  # OmegaConf's mark for a value that the user must give
-        raise InputError(path, expected=describe(kind), found="nothing", do=f"add {path}=… to the command")
+        raise NotGiven(path, expected=describe(kind), found="nothing", do=f"add {path}=… to the command")
     if origin is Literal:
         if value in typing.get_args(kind) and not isinstance(value, bool):
             return value

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import tempfile
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flows.config import Case
+from flows.batch import Batch, Work, work
+from flows.config import Missing
 from flows.graph import Graph, Node, short
-from flows.pipeline import Output, Planned, plan, plan_files, plan_pictures
 from flows.progress import Progress
 from flows.server import server
 from flows.stage import Job, run
@@ -35,85 +35,96 @@ class Outcome:
     computed: set[str] = field(default_factory=set)
 
 
-def run_sweep(cases: list[Case], show: bool = True) -> Path:
-    """Runs all cases in one flow and writes the report; returns its folder.
+def run_batch(batch: Batch, show: bool = True) -> Path:
+    """Runs all cases of all experiments in one flow and writes the reports; returns the report's folder, or the index.
 
     Raises InputError for bad data and StageFailed for a defect, after every stage that could run has run: what was
-    finished stays in the store.
+    finished stays in the store. Where there is an index, an experiment whose data is bad is left out and says why.
     """
-    absent = list(dict.fromkeys(case.config["dataset"]["path"] for case in cases if case.absent))
-    cases = [case for case in cases if not case.absent]
-    if not cases:
-        do = "set data_root to the folder that holds it, or dataset.path"
-        raise InputError("dataset.path", expected="the file of at least one dataset", found=f"no {absent[0]}", do=do)
-    config = cases[0].config
+    config = batch.config
     Store(config["store"]["path"])  # a store that cannot be used is said before anything starts
     with server() as ready:
-        graph = Graph()
-        planned = [plan(case, graph) for case in cases]
-        pictures = plan_pictures(planned, graph) if config["report"]["figures"] else []
-        files = plan_files(planned, graph)
+        graph, works = work(batch.experiments, config["report"]["figures"])
         ready()
-        left_out = [f"Not run: {Path(path).stem}, for its file is absent." for path in absent]
-        return Path(
-            _flow(config, graph, planned, pictures, files, left_out, show)(config["report"]["name"], len(cases))
-        )
+        cases = sum(len(experiment.cases) for experiment in batch.experiments)
+        return Path(_flow(batch, graph, works, show)(config["report"]["name"], cases))
 
 
-def _flow(
-    config: dict,
-    graph: Graph,
-    planned: list[Planned],
-    pictures: list[Node],
-    files: list[Output],
-    notes: list[str],
-    show: bool,
-):
+def _flow(batch: Batch, graph: Graph, works: list[Work], show: bool):
     """The flow of a sweep; its parameters are what the run's page shows."""
     from prefect import flow
+
+    config = batch.config
 
     @flow(name=config["report"]["name"], task_runner=task_runner(config["runner"]), validate_parameters=False)
     def sweep(experiment: str, cases: int) -> str:
         from flows.artifacts import ProgressArtifact, publish
+        from flows.reporting import write_index
 
         bar = ProgressArtifact(experiment, len(graph.nodes))
         with Progress(graph, show, bar.update) as progress:
-            for note in notes:
-                progress.note(note)
-            report, computed = _computed_report(config, graph, planned, pictures, files, notes, progress)
-        publish(report.folder, report.tables)
-        progress.finish(report.shown, report.folder, computed)
-        return str(report.folder)
+            for missing in (m for experiment in batch.experiments for m in experiment.missing):
+                progress.note(f"not run: {missing.what}, {missing.why}")
+            outcome, reports = _computed_reports(batch, graph, works, progress)
+        for report in [r for r in reports if r.folder]:
+            publish(report.folder, report.markdown)
+        if batch.index:
+            place = write_index(batch, reports)
+            progress.finish([report.line for report in reports], place, len(outcome.computed))
+            raise_first(graph, outcome, pardoned=InputError)
+            return str(place)
+        progress.finish(reports[0].shown, reports[0].folder, len(outcome.computed))
+        return str(reports[0].folder)
 
     return sweep
 
 
-def _computed_report(
-    config: dict,
-    graph: Graph,
-    planned: list[Planned],
-    pictures: list[Node],
-    files: list[Output],
-    notes: list[str],
-    progress: Progress,
-) -> tuple[Report, int]:
-    """The report and how many stages were computed for it."""
-    from flows.reporting import write
-
-    store = Store(config["store"]["path"])
+def _computed_reports(
+    batch: Batch, graph: Graph, works: list[Work], progress: Progress
+) -> tuple[Outcome, list[Report]]:
+    """The reports that could be written, and what became of the stages."""
+    store = Store(batch.config["store"]["path"])
     computed: set[str] = set()
     for attempt in range(1, ATTEMPTS + 1):
-        outcome = compute(graph, config, progress)
-        computed |= outcome.computed
-        raise_first(graph, outcome)
+        outcome = compute(graph, batch.config, progress)
+        outcome.computed |= computed
+        if not batch.index:
+            raise_first(graph, outcome)
         try:
-            return write(planned, pictures, files, graph, outcome.refs, computed, store, notes), len(computed)
+            return outcome, _written(works, outcome, store)
         except CorruptArtefact as error:
             if attempt == ATTEMPTS:
                 raise
             store.drop(error.stage, error.key)
+            computed = outcome.computed
             progress.note(f"{error}: it is computed again")
     raise AssertionError("not reached")
+
+
+def _written(works: list[Work], outcome: Outcome, store: Store) -> list[Report]:
+    """The reports of the experiments that have finished cases; cases that have not are missing, with the reason."""
+    from flows.reporting import Report, write
+
+    reports = []
+    for one in works:
+        done, missing = [], list(one.experiment.missing)
+        for planned in one.planned:
+            errors = [outcome.errors[n.id] for m in planned.metrics for n in m.walk() if n.id in outcome.errors]
+            if errors:
+                why = str(errors[0]) if isinstance(errors[0], InputError) else f"failed: {errors[0]!r}"
+                missing.append(Missing(planned.name, why, planned.case.config["dataset"]["stands_for"]))
+            else:
+                done.append(planned)
+        pictures = [node for node in one.pictures if node.id in outcome.refs]
+        files = [output for output in one.files if output[0].id in outcome.refs]
+        finished = replace(
+            one, experiment=replace(one.experiment, missing=missing), planned=done, pictures=pictures, files=files
+        )
+        if done:
+            reports.append(write(finished, outcome.refs, outcome.computed, store))
+        else:
+            reports.append(Report(finished.experiment))
+    return reports
 
 
 def compute(graph: Graph, config: dict, progress: Progress) -> Outcome:
@@ -189,9 +200,10 @@ def stage_task():
     return stage
 
 
-def raise_first(graph: Graph, outcome: Outcome) -> None:
-    """Raises the first error of a stage that failed itself, in the order of the graph."""
+def raise_first(graph: Graph, outcome: Outcome, pardoned: type[Exception] | tuple = ()) -> None:
+    """Raises the first error of a stage that failed itself, in the order of the graph, but none of the pardoned."""
     failed = [n for n in graph.nodes.values() if n.id in outcome.errors]
+    failed = [n for n in failed if not isinstance(outcome.errors[n.id], pardoned)]
     if not failed:
         return
     node, error = failed[0], outcome.errors[failed[0].id]

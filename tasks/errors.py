@@ -16,8 +16,12 @@ class InputError(Exception):
         super().__init__("".join(c if c.isprintable() else " " for c in message))
 
     def __reduce__(self):  # keyword-only arguments do not survive the default way between processes
-        return _rebuild, (self.where, self.expected, self.found, self.do)
+        return _rebuild, (type(self), self.where, self.expected, self.found, self.do)
 
 
-def _rebuild(where: str, expected: str, found: str, do: str) -> InputError:
-    return InputError(where, expected=expected, found=found, do=do)
+class NotGiven(InputError):
+    """Data that the user has not pointed to; a collection of experiments goes on without it and says so."""
+
+
+def _rebuild(kind: type[InputError], where: str, expected: str, found: str, do: str) -> InputError:
+    return kind(where, expected=expected, found=found, do=do)

@@ -309,6 +309,16 @@ class Picture:
     png: np.ndarray | None = None
     svg: str = ""
 
+    @property
+    def suffix(self) -> str:
+        """Of the picture's file."""
+        return "svg" if self.png is None else "png"
+
+    @property
+    def data(self) -> bytes:
+        """The content of the picture's file."""
+        return self.svg.encode() if self.png is None else self.png.tobytes()
+
 
 @dataclass(frozen=True)
 class Cloth:

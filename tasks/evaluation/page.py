@@ -14,7 +14,7 @@ from tasks.evaluation import typeset
 from tasks.evaluation.tables import Table
 from tasks.values import Picture
 
-_STYLE = """
+STYLE = """
 :root { color-scheme: light dark; --ink: #1d2026; --soft: #5b6270; --line: #dfe3e8; --page: #fff; --card: #f6f7f9;
   --ours: #2f6fd0; --real: #23855b; --subst: #a8650c }
 @media (prefers-color-scheme: dark) { :root { --ink: #e8eaee; --soft: #9aa3b2; --line: #2c313a; --page: #121418;
@@ -114,10 +114,10 @@ _PAGE = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_
 
 def html(title: str, tables: Sequence[Table], pictures: Sequence[Picture], provenance: Mapping[str, Any]) -> str:
     """The page. provenance: what it knows of command, git, machine, versions, seeds, inputs and stages is shown."""
-    shown = [(picture.caption, _inline(picture)) for picture in pictures]
+    shown = [(picture.caption, inline(picture)) for picture in pictures]
     made = [Markup(typeset.html(table)) for table in tables]
     facts, stages = facts_of(provenance), provenance.get("stages", [])
-    return _PAGE.render(title=title, style=Markup(_STYLE), tables=made, pictures=shown, facts=facts, stages=stages)
+    return _PAGE.render(title=title, style=Markup(STYLE), tables=made, pictures=shown, facts=facts, stages=stages)
 
 
 def facts_of(provenance: Mapping[str, Any]) -> dict[str, str]:
@@ -141,7 +141,7 @@ def _short(checksum: object) -> str:
     return f"{checksum[:12]}…" if isinstance(checksum, str) else f"of {len(checksum)} files"
 
 
-def _inline(picture: Picture) -> Markup:
+def inline(picture: Picture) -> Markup:
     """The picture inside the page: a drawing as it is, pixels as a data URI."""
     if picture.png is None:
         return Markup(picture.svg)

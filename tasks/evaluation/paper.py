@@ -29,11 +29,13 @@ class PaperCell:
 
 @dataclass(frozen=True)
 class Paper:
-    """A paper's printed cells. methods, columns: labels by method and by "dataset/subject"."""
+    """A paper's printed cells. methods, columns: labels by method and by "dataset/subject"; absent: why "methods" or
+    "columns" are not run here."""
 
     source: str
     methods: Mapping[str, str]
     columns: Mapping[str, str]
+    absent: Mapping[str, Mapping[str, str]]
     cells: tuple[PaperCell, ...]
 
     def table(self, number: int) -> tuple[PaperCell, ...]:
@@ -42,7 +44,7 @@ class Paper:
 
 
 def paper_of(config: Mapping[str, Any]) -> Paper:
-    """The paper from the content of its yaml file (keys source, methods, columns, cells).
+    """The paper from the content of its yaml file (keys source, methods, columns, absent, cells).
 
     Raises InputError, naming the cell, for an unknown key or metric, or two values for one cell.
     """
@@ -53,7 +55,7 @@ def paper_of(config: Mapping[str, Any]) -> Paper:
         if key in seen:
             raise InputError(f"paper.cells[{i}]", expected="one value a cell", found=f"a second one for {key}")
         seen.add(key)
-    return Paper(config["source"], dict(config["methods"]), dict(config["columns"]), cells)
+    return Paper(config["source"], dict(config["methods"]), dict(config["columns"]), dict(config["absent"]), cells)
 
 
 def _cell(index: int, entry: Mapping[str, Any]) -> PaperCell:

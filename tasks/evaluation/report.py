@@ -17,6 +17,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from tasks.errors import InputError
@@ -40,13 +41,15 @@ def write_report(
     """Writes a report, over an earlier one if there is any; files that only the earlier one had are removed.
 
     rows: as in metrics.csv; figures: (subject, picture), drawn into figures/<subject>_<name>; provenance: plain JSON
-    values, to which "files" is added, each file's sha256; brought: files that stages made.
-    Raises InputError where the folder cannot be written.
+    values, to which "figures", their captions, and "files", each file's sha256, are added; brought: files
+    that stages made. Raises InputError where the folder cannot be written.
     """
-    files = contents(f"Skelebones: {folder.name}", rows, tables, figures, provenance)
+    drawn = named(figures)
+    files = contents(folder.name, rows, tables, drawn, provenance)
     files |= {file.path: file.content.tobytes() for file in brought}
     sums = {name: hashlib.sha256(data).hexdigest() for name, data in files.items()}
-    text = json.dumps({**provenance, "files": sums}, indent=2, allow_nan=False) + "\n"
+    captions = {name: picture.caption for name, picture in drawn.items()}
+    text = json.dumps({**provenance, "figures": captions, "files": sums}, indent=2, allow_nan=False) + "\n"
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with _only_writer(folder):
@@ -58,30 +61,70 @@ def write_report(
 
 
 def contents(
-    title: str,
+    name: str,
     rows: pd.DataFrame,
     tables: Sequence[Table],
-    figures: Sequence[tuple[str, Picture]],
+    figures: Mapping[str, Picture],
     provenance: Mapping[str, Any],
 ) -> dict[str, bytes]:
-    """The files of a report but its provenance, by their names inside the folder. Raises ValueError where two figures
-    share a name."""
-    drawn: dict[str, bytes] = {}
-    links = []
-    for subject, picture in figures:
-        stem = re.sub(r"[^A-Za-z0-9_.-]+", "_", f"{subject}_{picture.name}")
-        name = f"figures/{stem}.{'svg' if picture.png is None else 'png'}"
-        if name in drawn:
-            raise ValueError(f"two figures are called {name}")
-        drawn[name] = picture.svg.encode() if picture.png is None else picture.png.tobytes()
-        links.append(f"![{picture.caption}]({name})\n\n*{picture.caption}*\n")
+    """The files of the report ``name`` but its provenance, by their names inside the folder."""
+    title = f"Skelebones: {name}"
+    links = [f"![{picture.caption}]({file})\n\n*{picture.caption}*\n" for file, picture in figures.items()]
     texts = {
         "metrics.csv": to_csv(rows),
         "table.md": "\n".join([f"# {title}\n", *(typeset.markdown(table) for table in tables), *links]),
         "table.tex": "\n".join(typeset.latex(table) for table in tables),
-        "table.html": page.html(title, tables, [picture for _, picture in figures], provenance),
+        "table.html": page.html(title, tables, list(figures.values()), provenance),
     }
-    return {name: text.encode() for name, text in texts.items()} | drawn
+    return {file: text.encode() for file, text in texts.items()} | {f: p.data for f, p in figures.items()}
+
+
+def named(figures: Sequence[tuple[str, Picture]]) -> dict[str, Picture]:
+    """Pictures by the names of their files. Raises ValueError where two share one."""
+    files: dict[str, Picture] = {}
+    for subject, picture in figures:
+        stem = re.sub(r"[^A-Za-z0-9_.-]+", "_", f"{subject}_{picture.name}")
+        name = f"figures/{stem}.{picture.suffix}"
+        if name in files:
+            raise ValueError(f"two figures are called {name}")
+        files[name] = picture
+    return files
+
+
+def read_provenance(folder: Path) -> dict[str, Any]:
+    """A report's provenance. Raises InputError where the folder holds no report."""
+    file = folder / PROVENANCE
+    try:
+        found = json.loads(file.read_text("utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(str(file), expected="the provenance of a report", found=str(error)) from error
+    if not isinstance(found, dict):
+        raise InputError(str(file), expected="the provenance of a report", found=type(found).__name__)
+    return found
+
+
+def read_figures(folder: Path, provenance: Mapping[str, Any]) -> dict[str, Picture]:
+    """A report's figures by the names of their files."""
+    found = {}
+    for name, caption in provenance["figures"].items():
+        data = (folder / name).read_bytes()
+        if name.endswith(".svg"):
+            found[name] = Picture(name, caption, None, data.decode())
+        else:
+            found[name] = Picture(name, caption, np.frombuffer(data, np.uint8))
+    return found
+
+
+def write_page(path: Path, text: str) -> None:
+    """Writes one page, whole or not at all. Raises InputError where it cannot be written."""
+    draft = path.with_name(f".{path.name}.new")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        draft.write_text(text, "utf-8")
+        os.replace(draft, path)
+    except OSError as error:
+        found = error.strerror or str(error)
+        raise InputError(str(path), expected="a page that can be written", found=found) from error
 
 
 def _replace(folder: Path, files: Mapping[str, bytes]) -> None:

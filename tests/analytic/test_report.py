@@ -52,6 +52,7 @@ def test_everything_is_there_and_checked(tmp_path):
     assert set(found) == {"metrics.csv", "table.md", "table.tex", "table.html", "provenance.json"} | pictures
     written = json.loads(found.pop("provenance.json"))
     assert written.pop("files") == {name: hashlib.sha256(data).hexdigest() for name, data in found.items()}
+    assert written.pop("figures").keys() == pictures
     assert written == PROVENANCE
     assert from_csv(found["metrics.csv"].decode(), "metrics.csv").equals(rows)
     assert all(f"]({name})" in found["table.md"].decode() for name in pictures)

@@ -34,7 +34,7 @@ def load(
     *,
     path: str,
     size: int | None,
-    background: Literal["white", "black"] | None,
+    background: Literal["none", "white", "black"],
     up: Literal["y", "z"],
     fps: float,
     unit: Literal["unit", "m"],
@@ -42,7 +42,7 @@ def load(
     """(train, test) captures of a folder in the layout above, the world turned so that up is +Y.
 
     size: pixels of the longer side that images are brought down to, null as they are. background: behind images without
-    alpha, which are refused when it is null; with alpha, null is white. up: the axis of the file's world that is up.
+    alpha, which are refused when it is none; with alpha, none is white. up: the axis of the file's world that is up.
     fps: where the file does not say; the times of both halves are one list, so a frame is the same time in both.
     Raises InputError for missing or unreadable files and for all that :mod:`validate` checks.
     """

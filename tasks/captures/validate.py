@@ -37,9 +37,9 @@ def check(where: str, capture: Capture, *, training: bool) -> Capture:
     return capture
 
 
-def background(where: str, name: str | None, has_alpha: bool) -> np.ndarray:
-    """The colour behind the subject: as named, white for images with alpha where nothing is said. (3,)"""
-    if name is None and not has_alpha:
+def background(where: str, name: str, has_alpha: bool) -> np.ndarray:
+    """The colour behind the subject: as named, white for images with alpha where it is none. (3,)"""
+    if name == "none" and not has_alpha:
         raise InputError(
             where,
             expected="images with alpha, or a known background",

@@ -17,8 +17,8 @@ from tasks.captures.scenes import render_scene
 from tasks.errors import InputError
 from tests.analytic.test_scenes import SCENE, ball
 
-DNERF = {"size": None, "background": None, "up": "z", "fps": 30.0, "unit": "unit"}
-MULTIVIEW = {"size": None, "background": None}
+DNERF = {"size": None, "background": "none", "up": "z", "fps": 30.0, "unit": "unit"}
+MULTIVIEW = {"size": None, "background": "none"}
 
 
 @pytest.fixture(scope="module")

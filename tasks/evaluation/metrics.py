@@ -60,6 +60,10 @@ METRICS: dict[str, Metric] = {
     "psnr": Metric("PSNR", "decibel", "higher", "peak signal-to-noise ratio of rendered images", 2),
     "ssim": Metric("SSIM", "ratio", "higher", "structural similarity of rendered images", 3),
     "lpips": Metric("LPIPS", "ratio", "lower", "learned perceptual distance of rendered images", 4),
+    "path_pct": Metric(
+        "path error", "percent", "lower", "Gaussians' paths to those of the true surface, % of diagonal", 2
+    ),
+    "path_start_pct": Metric("off the surface", "percent", "lower", "the same at the reference time alone", 2),
     "optimise_hours": Metric("optimisation", "hours", "lower", "time to optimise one scene", 2),
     "time_ratio": Metric("time ratio", "ratio", "lower", "benchmarks: seconds on the wall, ours / the peer's", 4),
     "cpu_ratio": Metric("processor time ratio", "ratio", "lower", "the same for the processor time of all threads", 4),

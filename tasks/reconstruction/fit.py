@@ -62,7 +62,8 @@ def fit(
     largest: images with a longer side are scaled down to it.
 
     Start: the visual ``hull`` of the hull_views images round the reference frame (null: chosen, see
-    :func:`hull_start`), inside at least the share hull_agree of the masks, hull_cells along its longest side; or a ``ball``.
+    :func:`hull_start`), inside at least the share hull_agree of the masks, hull_cells along its longest
+    side; or a ``ball``.
     Curriculum: see :class:`Schedule` for static, grown, coarsest, full (shares).
     Density: ``gaussians`` at the start; every divide_every steps, up to the share divide_until of the iterations, those
     that are pulled hardest are divided, and the number grows by the share ``growth`` up to max_gaussians.

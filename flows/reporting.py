@@ -13,6 +13,7 @@ from flows.config import CONF, NO_ABLATION, Case
 from flows.pipeline import Planned
 from flows.provenance import command, provenance
 from flows.store import Ref, Store
+from tasks.errors import InputError
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -122,9 +123,19 @@ def made_again(folder: Path) -> dict[str, bytes]:
     from tasks.evaluation.rows import from_csv
 
     origin = report.read_provenance(folder)
+    if "said" not in origin:
+        do = f"run it again: {' '.join(origin.get('command', []))}"
+        raise InputError(str(folder), expected="a report of this version", found="an older one", do=do)
     rows = from_csv((folder / "metrics.csv").read_text("utf-8"), str(folder / "metrics.csv"))
     tables = tables_of([Case(**case) for case in origin["cases"]], rows, origin["remarks"], origin["said"])
     return report.contents(folder.name, rows, tables, report.read_figures(folder, origin), origin)
+
+
+def render_again(folder: Path) -> int:
+    """Writes the files of :func:`made_again` over a report's own; returns how many changed."""
+    from tasks.evaluation import report
+
+    return report.replace_files(folder, made_again(folder))
 
 
 def write_index(batch: Batch, reports: list[Report]) -> Path:

@@ -23,6 +23,7 @@ examples:
   python -m flows.run +experiment=paper                           every table and ablation, and one page that holds them
   python -m flows.run -m bones.max_bones=10,20,30                 one table with a row for every value
   python -m flows.run +ablation=k_1 method=partmm                 one line of the config changed
+  python -m flows.run +experiment=paper plan=true                 what would be computed and what it would cost
   python -m flows.run --cfg +experiment=table3                    print the config and run nothing
 """
 
@@ -44,6 +45,11 @@ def main(arguments: list[str] | None = None) -> int:
         if known.cfg:
             cases = [case for experiment in run.experiments for case in experiment.cases]
             print("---\n".join(f"# {c.dataset} {c.method} {c.variant}\n{config.to_yaml(c)}" for c in cases))
+            return 0
+        if run.config["plan"]:
+            from flows.forecast import show
+
+            show(run)
             return 0
         from flows.sweep import run_batch
 

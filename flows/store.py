@@ -13,7 +13,7 @@ import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +50,23 @@ class Ref:
     cached: bool = False
 
 
+@dataclass(frozen=True)
+class Artefact:
+    """A stored artefact as its meta.json describes it. outputs: name -> content digest, empty where it cannot be read;
+    size: bytes of its files; written: when, in seconds since the epoch; seconds, peak_mb: what computing it cost."""
+
+    stage: str
+    key: str
+    size: int
+    written: float
+    function: str = ""
+    case: str = ""
+    settings: dict = field(default_factory=dict)
+    outputs: dict[str, str] = field(default_factory=dict)
+    seconds: float = 0.0
+    peak_mb: float = 0.0
+
+
 def encode(value: object) -> bytes:
     """A value of ``tasks.values`` as safetensors bytes: arrays as tensors, the rest as one JSON header."""
     arrays: dict[str, np.ndarray] = {}
@@ -72,10 +89,11 @@ def canonical_json(value: object) -> str:
 class Store:
     """A folder of artefacts; safe for several processes at once."""
 
-    def __init__(self, path: str | os.PathLike) -> None:
+    def __init__(self, path: str | os.PathLike, *, create: bool = True) -> None:
         self.path = Path(path)
-        with explained(self.path):
-            self.path.mkdir(parents=True, exist_ok=True)
+        if create:
+            with explained(self.path):
+                self.path.mkdir(parents=True, exist_ok=True)
 
     def folder(self, stage: str, key: str) -> Path:
         """Where an artefact lies, whether or not it is there."""
@@ -86,13 +104,16 @@ class Store:
         return self.path / stage / f"{key}.part"
 
     @contextmanager
-    def lock(self, stage: str, key: str) -> Iterator[None]:
-        """Holds the artefact's lock. It belongs to the process and dies with it, so no crash leaves it behind."""
+    def lock(self, stage: str, key: str, wait: float = -1) -> Iterator[None]:
+        """Holds the artefact's lock. It belongs to the process and dies with it, so no crash leaves it behind.
+
+        wait: seconds to wait for another holder before filelock's Timeout is raised; -1 for as long as it takes.
+        """
         target = self.folder(stage, key)
         with explained(self.path):
             target.parent.mkdir(parents=True, exist_ok=True)
             lock = FileLock(f"{target}.lock")
-            lock.acquire()
+            lock.acquire(wait)
         try:
             yield
         finally:
@@ -110,6 +131,25 @@ class Store:
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             return None  # absent or cut short: compute it again
         return None
+
+    def artefacts(self) -> list[Artefact]:
+        """All artefacts, by stage and key; a folder whose meta.json cannot be read is one that says nothing."""
+        return [_read(folder) for folder in sorted(self.path.glob("*/*")) if _is_artefact(folder)]
+
+    def damage(self, artefact: Artefact) -> str:
+        """What is wrong with an artefact's files, or "" where every digest is right."""
+        if not artefact.outputs:
+            return "meta.json cannot be read"
+        for name, digest in artefact.outputs.items():
+            file = self.folder(artefact.stage, artefact.key) / f"{name}.safetensors"
+            try:
+                with open(file, "rb") as stream:
+                    found = hashlib.file_digest(stream, "sha256").hexdigest()
+            except OSError as error:
+                return f"{file.name}: {error.strerror or error}"
+            if found != digest:
+                return f"{file.name} holds other bytes than were written"
+        return ""
 
     def put(self, stage: str, key: str, values: dict[str, object], meta: dict) -> Ref:
         """Writes an artefact; the caller holds its lock. A damaged predecessor is replaced."""
@@ -173,6 +213,23 @@ def explained(path: Path) -> Iterator[None]:
         raise InputError(f"{path}", expected=expected, found=found, do=do) from error
 
 
+def _is_artefact(folder: Path) -> bool:
+    return folder.is_dir() and folder.suffix == ""  # not a draft or a long stage's scratch folder
+
+
+def _read(folder: Path) -> Artefact:
+    files = [file.stat() for file in folder.iterdir() if file.is_file()]
+    place = folder.parent.name, folder.name, sum(s.st_size for s in files)
+    written = max((s.st_mtime for s in files), default=folder.stat().st_mtime)
+    try:
+        meta = json.loads((folder / "meta.json").read_text("utf-8"))
+        outputs = {name: output["digest"] for name, output in meta["outputs"].items()}
+        about = meta["function"], meta["case"], meta["settings"], outputs, meta["seconds"], meta["peak_mb"]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return Artefact(*place, written)
+    return Artefact(*place, written, *about)
+
+
 def _describe(value: object, prefix: str, arrays: dict[str, np.ndarray]) -> object:
     if isinstance(value, np.ndarray):
         arrays[prefix] = np.ascontiguousarray(value)
@@ -212,3 +269,9 @@ def _sync_folder(path: Path) -> None:
             os.fsync(descriptor)
         finally:
             os.close(descriptor)
+
+
+if __name__ == "__main__":
+    from flows.housekeeping import main
+
+    raise SystemExit(main())

@@ -158,7 +158,7 @@ def _pass(graph: Graph, config: dict, progress: Progress, outcome: Outcome) -> N
         while waiting or running:
             for node in [n for n in waiting if all(u.id in outcome.refs for u in n.upstream())]:
                 waiting.remove(node)
-                job = _job(node, outcome.refs, config, events)
+                job = job_of(node, outcome.refs, config, events)
                 named = task.with_options(name=node.stage, task_run_name=f"{node.stage} · {short(node.cases)}")
                 future = named.submit(job, wait_for=[futures[u.id] for u in node.upstream() if u.id in futures])
                 running[future] = node
@@ -224,7 +224,9 @@ def task_runner(settings: dict):
     return kinds[settings["kind"]](max_workers=workers)
 
 
-def _job(node: Node, refs: dict[str, Ref], config: dict, events: str) -> Job:
+def job_of(node: Node, refs: dict[str, Ref], config: dict, events: str | None) -> Job:
+    """The node's work, once the artefacts of its inputs are known."""
+
     def resolve(value):
         if isinstance(value, dict):
             return {n: resolve(v) for n, v in value.items()}

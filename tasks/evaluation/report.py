@@ -115,6 +115,20 @@ def read_figures(folder: Path, provenance: Mapping[str, Any]) -> dict[str, Pictu
     return found
 
 
+def replace_files(folder: Path, files: Mapping[str, bytes]) -> int:
+    """Writes some files of a report over those it has and their checksums into its provenance; returns how many
+    changed."""
+    origin = read_provenance(folder)
+    changed = {name: data for name, data in files.items() if (folder / name).read_bytes() != data}
+    sums = {name: hashlib.sha256(data).hexdigest() for name, data in changed.items()}
+    text = json.dumps({**origin, "files": origin["files"] | sums}, indent=2, allow_nan=False) + "\n"
+    for name, data in {**changed, PROVENANCE: text.encode()}.items() if changed else ():
+        draft = folder / f"{_STAGING}{Path(name).name}"
+        draft.write_bytes(data)
+        os.replace(draft, folder / name)
+    return len(changed)
+
+
 def write_page(path: Path, text: str) -> None:
     """Writes one page, whole or not at all. Raises InputError where it cannot be written."""
     draft = path.with_name(f".{path.name}.new")

@@ -59,6 +59,8 @@ METRICS: dict[str, Metric] = {
     "b2b_pct": Metric("B2B", "percent", "lower", "Chamfer distance bone to bone", 2),
     "psnr": Metric("PSNR", "decibel", "higher", "peak signal-to-noise ratio of rendered images", 2),
     "ssim": Metric("SSIM", "ratio", "higher", "structural similarity of rendered images", 3),
+    "ssim_down": Metric("SSIM, shrunk", "ratio", "higher", "the same of images first shrunk to about 256 pixels", 3),
+    "flip": Metric("FLIP", "ratio", "lower", "perceived difference of rendered images (LDR-FLIP)", 4),
     "lpips": Metric("LPIPS", "ratio", "lower", "learned perceptual distance of rendered images", 4),
     "path_pct": Metric(
         "path error", "percent", "lower", "Gaussians' paths to those of the true surface, % of diagonal", 2

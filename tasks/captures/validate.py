@@ -83,9 +83,6 @@ def notes(capture: Capture) -> list[str]:
         if len(near):
             pair = f"{capture.times[near[0]]:.5g} and {capture.times[near[0] + 1]:.5g}"
             found.append(f"{len(near)} times nearly equal the next, first {pair}: they count as frames of their own")
-    unseen = len(capture.times) - len(np.unique(capture.frame))
-    if unseen:
-        found.append(f"{unseen} of {len(capture.times)} times have no image here")
     return found
 
 

@@ -196,7 +196,8 @@ def notes(motion: Motion) -> list[str]:
     ]
     if still:
         found.append(f"clips that do not move: {', '.join(still)}")
-    if motion.rig is not None and (error := rig_error(motion)) > RIG_NOTED:
+    bound = motion.rig is not None and motion.rest is not None and len(motion.rig.weights)
+    if bound and (error := rig_error(motion)) > RIG_NOTED:
         found.append(f"the given skeleton alone leaves up to {100 * error:.2g} % of the diagonal unexplained")
     return found
 

@@ -22,12 +22,15 @@ _OWNS = 0.5  # a joint moves skin when it outweighs all others together somewher
 
 def counting_joints(rig: Rig, degrees: float) -> tuple[np.ndarray, np.ndarray]:
     """The joints that motion can reveal: they move skin and somewhere turn more than ``degrees`` from the parent.
+    Where the rig has no skin weights, all count that turn.
 
     Returns positions (K, 3) and parents (K,): the nearest ancestor that counts, or -1.
     """
     identity = np.eye(3, dtype=rig.rotations.dtype)
     turn = np.degrees(geodesic(rig.rotations, identity).max(axis=0))
-    counts = (turn > degrees) & (rig.weights.max(axis=0) > _OWNS)
+    counts = turn > degrees
+    if len(rig.weights):
+        counts &= rig.weights.max(axis=0) > _OWNS
     keep = np.flatnonzero(counts)
     new = np.full(len(counts), -1)
     new[keep] = np.arange(len(keep))

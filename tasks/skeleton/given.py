@@ -2,16 +2,34 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from tasks.errors import InputError
+from tasks.geometry import kinematics
 from tasks.geometry.rebase import rebased
+from tasks.geometry.sparse_weights import fit_weights
 from tasks.values import Canonical, Motion, Poses, Rig, Skeleton
+
+INFLUENCES = 4  # joints a point may follow, as SMPL has it
+EXCHANGES = 8  # tries to replace one of them by a better one
 
 
 def given_skeleton(train: Motion, canonical: Canonical) -> Skeleton:
     """The data's own tree and skin weights, its joints where they are in the canonical shape: at rest, or in the
-    training frame that was chosen. Raises InputError where the data brings no skeleton."""
+    training frame that was chosen.
+
+    Where the data's skeleton comes without weights, since no mesh belongs to it (joint rotations beside images), they
+    are fitted to how the points move in the training frames: the sparse convex weights with which the joints' own
+    transforms follow best (Le & Deng 2012, eq. 3). Raises InputError where the data brings no skeleton.
+    """
     rig = _at(_rig(train), train, canonical)
-    return Skeleton(rig.names, rig.parents, rig.joints, rig.weights)
+    weights = rig.weights if len(rig.weights) else _fitted_weights(rig, train, canonical)
+    return Skeleton(rig.names, rig.parents, rig.joints, weights)
+
+
+def _fitted_weights(rig: Rig, train: Motion, canonical: Canonical) -> np.ndarray:
+    joints = kinematics.forward(rig.parents, rig.joints, rig.rotations, rig.translations)
+    return fit_weights(canonical.points, train.points, joints, influences=INFLUENCES, exchanges=EXCHANGES)
 
 
 def given_poses(motion: Motion, train: Motion, canonical: Canonical, skeleton: Skeleton) -> Poses:

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from functools import cache
 
 import igl
@@ -12,7 +13,8 @@ import pytest
 from tasks.datasets.creature import load
 from tasks.errors import InputError
 from tasks.geometry import kinematics, measure, neighbours, rotations, skinning
-from tasks.values import Motion, same
+from tasks.skeleton.given import given_poses, given_skeleton
+from tasks.values import Canonical, Motion, same
 
 SETTINGS = {"frames_per_clip": 50, "vertices": 6000, "seed": 0}
 SUBJECTS = ("animal", "figure")
@@ -40,6 +42,27 @@ def skinned(m: Motion) -> np.ndarray:
 def test_without_softness_skinning_is_the_whole_truth(subject: str) -> None:
     stiff = load(subject=subject, softness=0.0, frames_per_clip=16, vertices=5000, seed=3)
     np.testing.assert_allclose(stiff.points, skinned(stiff), atol=2e-6)
+
+
+@pytest.mark.parametrize("frame", [-1, 0])
+def test_withheld_weights_are_found_by_motion(creature: Motion, frame: int) -> None:
+    """Fitted to all clips but two, they explain those two as well as the true weights do, to a tenth."""
+    rig = replace(creature.rig, weights=np.zeros((0, len(creature.rig.names)), np.float32))
+    clips, unseen = creature.clip_names, {"gallop", "jump", "kick", "spin"}
+    train, test = (
+        replace(creature, rig=rig).take_clips([c for c, name in enumerate(clips) if (name in unseen) == held])
+        for held in (False, True)
+    )
+    shape = Canonical(train.rest if frame < 0 else train.points[frame], train.faces, frame, "given")
+    skeleton = given_skeleton(train, shape)
+    poses = given_poses(test, train, shape, skeleton)
+    world = kinematics.forward(skeleton.parents, skeleton.joints, poses.rotations, poses.translations)
+    found = measure.vertex_rmse(skinning.skin(shape.points, skeleton.weights, world), test.points)
+    true = measure.vertex_rmse(skinning.skin(shape.points, creature.rig.weights, world), test.points)
+    assert found < 1.1 * true
+    assert (skeleton.weights >= 0).all()
+    assert (skeleton.weights > 0).sum(1).max() <= 4
+    np.testing.assert_allclose(skeleton.weights.sum(1), 1, atol=1e-5)
 
 
 def test_soft_parts_swing_and_the_rest_is_skinning_exactly(creature: Motion) -> None:

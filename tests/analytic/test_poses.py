@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -152,6 +154,24 @@ def test_a_given_skeleton_is_passed_on_and_a_missing_one_is_named():
         given_skeleton(plain, shape.canonical)
     with pytest.raises(InputError, match="2 joints"):
         given_poses(motion, motion, shape.canonical, skeleton_of(ball_joint()))
+
+
+@pytest.mark.parametrize("frame", [-1, 7])
+def test_a_given_skeleton_without_weights_is_bound_to_the_points_it_moves(frame):
+    """The weights that made the motion come back, at rest exactly, from a posed frame as well as skinning allows."""
+    shape = chain()
+    _, shifts = kinematics.local_poses(shape.parents, shape.joints, shape.transforms)
+    names, joints = ("a", "b", "c", "d"), shape.joints.astype(np.float32)
+    rig = Rig(names, shape.parents, joints, np.zeros((0, 4), np.float32), shape.rotations, shifts)
+    motion = replace(shape.motion, rig=rig)
+    at = shape.canonical if frame < 0 else Canonical(motion.points[frame], None, frame, "posed")
+    skeleton = given_skeleton(motion, at)
+    poses = given_poses(motion, motion, at, skeleton)
+    world = kinematics.forward(skeleton.parents, skeleton.joints, poses.rotations, poses.translations)
+    size = diagonal(shape.canonical.points)
+    assert vertex_rmse(skin(at.points, skeleton.weights, world), motion.points) < (1e-4 if frame < 0 else 2e-3) * size
+    if frame < 0:
+        np.testing.assert_allclose(skeleton.weights, shape.weights, atol=0.02)
 
 
 def test_a_given_skeleton_may_start_from_a_posed_frame():

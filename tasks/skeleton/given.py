@@ -6,12 +6,14 @@ import numpy as np
 
 from tasks.errors import InputError
 from tasks.geometry import kinematics
+from tasks.geometry.measure import diagonal, vertex_rmse
 from tasks.geometry.rebase import rebased
 from tasks.geometry.sparse_weights import fit_weights
 from tasks.values import Canonical, Motion, Poses, Rig, Skeleton
 
 INFLUENCES = 4  # joints a point may follow, as SMPL has it
 EXCHANGES = 8  # tries to replace one of them by a better one
+RESEMBLES = 0.03  # of the diagonal: a shape no further from a frame, point by point, is that frame
 
 
 def given_skeleton(train: Motion, canonical: Canonical) -> Skeleton:
@@ -20,7 +22,9 @@ def given_skeleton(train: Motion, canonical: Canonical) -> Skeleton:
 
     Where the data's skeleton comes without weights, since no mesh belongs to it (joint rotations beside images), they
     are fitted to how the points move in the training frames: the sparse convex weights with which the joints' own
-    transforms follow best (Le & Deng 2012, eq. 3). Raises InputError where the data brings no skeleton.
+    transforms follow best (Le & Deng 2012, eq. 3). A rest shape then counts as posed like the training frame that it
+    resembles, if it does (Gaussians at rest lie as in their reference frame), else like the skeleton at rest. Raises
+    InputError where the data brings no skeleton.
     """
     rig = _at(_rig(train), train, canonical)
     weights = rig.weights if len(rig.weights) else _fitted_weights(rig, train, canonical)
@@ -44,7 +48,16 @@ def given_poses(motion: Motion, train: Motion, canonical: Canonical, skeleton: S
 
 
 def _at(rig: Rig, train: Motion, canonical: Canonical) -> Rig:
-    return rig if canonical.frame < 0 else rebased(rig, _rig(train), canonical.frame)
+    """The rig from the canonical pose on."""
+    frame = canonical.frame if canonical.frame >= 0 or len(rig.weights) else _resembled(train, canonical)
+    return rig if frame < 0 else rebased(rig, _rig(train), frame)
+
+
+def _resembled(train: Motion, canonical: Canonical) -> int:
+    """The training frame that the canonical shape is, or -1."""
+    apart = [vertex_rmse(frame[None], canonical.points[None]) for frame in train.points]
+    nearest = int(np.argmin(apart))
+    return nearest if apart[nearest] < RESEMBLES * diagonal(canonical.points) else -1
 
 
 def _rig(motion: Motion) -> Rig:

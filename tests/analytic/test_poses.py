@@ -156,15 +156,16 @@ def test_a_given_skeleton_is_passed_on_and_a_missing_one_is_named():
         given_poses(motion, motion, shape.canonical, skeleton_of(ball_joint()))
 
 
-@pytest.mark.parametrize("frame", [-1, 7])
-def test_a_given_skeleton_without_weights_is_bound_to_the_points_it_moves(frame):
-    """The weights that made the motion come back, at rest exactly, from a posed frame as well as skinning allows."""
+@pytest.mark.parametrize(("frame", "told"), [(-1, True), (7, True), (7, False)])
+def test_a_given_skeleton_without_weights_is_bound_to_the_points_it_moves(frame, told):
+    """The weights that made the motion come back, at rest exactly, from a posed frame as well as skinning allows; also
+    where that frame is not named."""
     shape = chain()
     _, shifts = kinematics.local_poses(shape.parents, shape.joints, shape.transforms)
     names, joints = ("a", "b", "c", "d"), shape.joints.astype(np.float32)
     rig = Rig(names, shape.parents, joints, np.zeros((0, 4), np.float32), shape.rotations, shifts)
     motion = replace(shape.motion, rig=rig)
-    at = shape.canonical if frame < 0 else Canonical(motion.points[frame], None, frame, "posed")
+    at = shape.canonical if frame < 0 else Canonical(motion.points[frame], None, frame if told else -1, "posed")
     skeleton = given_skeleton(motion, at)
     poses = given_poses(motion, motion, at, skeleton)
     world = kinematics.forward(skeleton.parents, skeleton.joints, poses.rotations, poses.translations)

@@ -69,5 +69,5 @@ def _append(params: dict[str, torch.Tensor], adam: Adam, name: str, rows: np.nda
         return
     old = params[name].data
     params[name] = torch.cat([old, old[rows]]).requires_grad_()
-    for moments in (adam.first, adam.second):
+    for moments in (m for m in (adam.first, adam.second) if name in m):
         moments[name] = torch.cat([moments[name], moments[name][rows]])

@@ -41,6 +41,7 @@ def fit(
     neighbours: int,
     carriers: int,
     images_per_knot: float,
+    smooth_weight: float,
     depth: int,
     width: int,
     skip: int,
@@ -71,7 +72,8 @@ def fit(
     Rigidity (GA eq. 3 and 4): over ``neighbours`` of ``carriers`` (the nodes; or points spread over the thing, moved by
     the network). ``own``: each carrier's own rotation, ``svd``: the one that fits best; weights for ARAP and for kept
     distances, which fall to the share rigidity_end of themselves.
-    images_per_knot: of the nodes' splines, a knot at most every frame. depth, width, skip: the network's; deltas: it
+    images_per_knot: of the nodes' splines, a knot at most every frame;
+    smooth_weight: of the squared second differences of knots. depth, width, skip: the network's; deltas: it
     also changes scale and opacity. rate_…: Adam's, for a thing of about unit size; all fall to the share rate_end.
     averaged: the share of the last iterations of which the mean is the result.
 
@@ -94,7 +96,9 @@ def _check(recipe: dict) -> None:
     rules += [(n, 0.0 <= recipe[n] <= 1.0, "a share, 0 to 1") for n in shares]
     rates = [n for n in recipe if n.startswith("rate_")]
     rules += [(n, recipe[n] > 0, "a positive number") for n in (*rates, "coarsest", "images_per_knot")]
-    rules += [(n, recipe[n] >= 0, "0 or more") for n in ("cover", "arap_weight", "distance_weight", "growth")]
+    rules += [
+        (n, recipe[n] >= 0, "0 or more") for n in ("cover", "arap_weight", "distance_weight", "smooth_weight", "growth")
+    ]
     rules += [
         ("sh_degree", 0 <= recipe["sh_degree"] <= 3, "0, 1, 2 or 3"),
         ("coarsest", recipe["coarsest"] <= 1, "at most 1"),

@@ -147,7 +147,7 @@ class Fitting:
             means = moved.means
             scales = scales if moved.log_scales is None else scales + moved.log_scales
             opacities = opacities if moved.opacities is None else opacities + moved.opacities
-            terms = self._rigidity(moved)
+            terms = self._rigidity(moved) | self._roughness()
         if means is not params["means"]:
             means.retain_grad()
         background = self._background()
@@ -172,6 +172,10 @@ class Fitting:
         rigid, kept = self.neighbours.rigidity(moved.carriers, moved.turns if recipe.arap == "own" else None)
         falls = recipe.rigidity_end ** (self.iteration / recipe.iterations) if recipe.rigidity_end > 0 else 1.0
         return {"arap": falls * recipe.arap_weight * rigid, "distance": falls * recipe.distance_weight * kept}
+
+    def _roughness(self) -> dict[str, torch.Tensor]:
+        rough = self.deformation.roughness() if self.recipe.smooth_weight > 0 else None
+        return {} if rough is None else {"smooth": self.recipe.smooth_weight * rough}
 
     def _background(self) -> torch.Tensor:
         """The data's own, or any colour where alpha tells the thing from it: nothing can then hide in it."""

@@ -78,6 +78,9 @@ class Mlp:
         with torch.no_grad():
             return rotation_of(self.out(frame, means)[:, 3:6]).cpu().numpy()
 
+    def roughness(self) -> torch.Tensor | None:
+        """The bands of time bound how fast it may change: nothing to ask."""
+
     def copy_outwards(self, first: int, last: int, clip: int) -> None:
         """A network has no knots: frames not seen yet are what it makes of them."""
 

@@ -7,6 +7,8 @@ one parameter and a stiff rigidity term still converges.
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
@@ -37,6 +39,7 @@ class Nodes:
         self._last = torch.tensor([0.0, 0, 0, 1]).expand(self.count, 1, 4)
         self._tree = cKDTree(fine)
         self._radius = float(np.median(self._tree.query(fine, k=2)[0][:, 1])) if len(fine) > 1 else 1.0
+        self._inner = torch.from_numpy(np.concatenate([np.arange(a, b - 2) for a, b in pairwise(spline.clip_knots)]))
         self.index = self.weights = None
 
     @classmethod
@@ -86,6 +89,11 @@ class Nodes:
         """(N, 3, 3) blended turns of the Gaussians, near to rotations."""
         blended = self.transforms(frame).detach()[..., :3].numpy()[self.index.numpy()]
         return np.einsum("nk,nkab->nab", self.weights.numpy(), blended)
+
+    def roughness(self) -> torch.Tensor:
+        """Squared second differences of the knots, of each clip for itself: summed over nodes, mean over time."""
+        bend = self.table[self._inner] - 2 * self.table[self._inner + 1] + self.table[self._inner + 2]
+        return bend.square().sum() / len(self._inner)
 
     def copy_outwards(self, first: int, last: int, clip: int) -> None:
         """Frames outside first..last of a clip take the pose at that end: what has not been seen yet starts there."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from flows import config, schema
 from flows.config import Case, Missing
 from flows.graph import Graph, Node, union
-from flows.pipeline import Output, Planned, plan, plan_files, plan_pictures
+from flows.pipeline import Output, Planned, plan, plan_files, plan_pictures, plan_videos
 from tasks.errors import InputError
 
 OF_THE_WHOLE = ("sweep.experiments", "report.name", "report.title")  # overrides that single experiments do not get
@@ -75,8 +75,10 @@ def batch(overrides: list[str], multirun: bool = False) -> Batch:
     return Batch(whole, experiments, True)
 
 
-def work(experiments: list[Experiment], figures: bool) -> tuple[Graph, list[Work]]:
-    """The stages of every experiment that has cases, and the graph of all of them in which equal stages are one."""
+def work(experiments: list[Experiment], report: dict) -> tuple[Graph, list[Work]]:
+    """The stages of every experiment that has cases, and the graph of all of them in which equal stages are one.
+
+    report: whether there are figures and videos."""
     files: dict[str, str] = {}
     works = []
     for experiment in experiments:
@@ -84,7 +86,8 @@ def work(experiments: list[Experiment], figures: bool) -> tuple[Graph, list[Work
             continue
         graph = Graph(files)
         planned = [plan(case, graph) for case in experiment.cases]
-        pictures = plan_pictures(planned, graph) if figures else []
+        pictures = plan_videos(planned, graph) if report["videos"] else []
+        pictures += plan_pictures(planned, graph) if report["figures"] else []
         works.append(Work(experiment, graph, planned, pictures, plan_files(planned, graph)))
     return union([w.graph for w in works]), works
 

@@ -83,7 +83,7 @@ def critical_path(forecasts: list[Forecast]) -> float:
 
 def show(batch: Batch) -> None:
     """Prints the plan of a run: every stage to compute, sums by stage, and the whole."""
-    graph, works = work(batch.experiments, batch.config["report"]["figures"])
+    graph, works = work(batch.experiments, batch.config["report"])
     forecasts = forecast(graph, batch.config)
     console = Console(highlight=False, soft_wrap=True)
     for f in forecasts:

@@ -15,6 +15,7 @@ from flows.graph import Graph, Node
 from flows.intake import Output
 from flows.source import signature
 
+IN_VIDEOS = (("robust_lbs", "lbs"), ("fullmm",), ("partmm",))  # side by side: the first of each that was run
 PANELS = 4  # methods or variants side by side in the picture of errors
 
 
@@ -194,6 +195,24 @@ def _views_pictures(planned: list[Planned], graph: Graph) -> list[Node]:
         function, truth = "tasks.evaluation.pictures:views_picture", cases[0].nodes["seen"]
         inputs = {"truth": truth, "rendered": dict(list(rendered.items())[-PANELS:])}
         found.append(graph.add("figures", function, {}, outputs=("picture",), case=cases[0].case.data, **inputs))
+    return found
+
+
+def plan_videos(planned: list[Planned], graph: Graph) -> list[Node]:
+    """For every dataset, truth and the methods of ``IN_VIDEOS`` in an unseen clip; where fewer than two of them were
+    run, none."""
+    found = []
+    planned = [p for p in planned if "animation" in p.nodes and p.case.variant == NO_ABLATION]
+    for data in dict.fromkeys(p.case.data for p in planned):
+        methods = {p.case.method: p for p in reversed(planned) if p.case.data == data}  # of several seeds, the first
+        chosen = [next((methods[m] for m in names if m in methods), None) for names in IN_VIDEOS]
+        shown = [p for p in chosen if p]
+        if len(shown) < 2:
+            continue
+        animations = {label: p.nodes["animation"] for label, p in zip(_labels(shown), shown, strict=True)}
+        inputs = {n: shown[0].nodes[n] for n in ("test", "canonical")} | {"animations": animations}
+        function, settings = "tasks.evaluation.pictures:clip_picture", {"focus": list(animations)[-1]}
+        found.append(graph.add("video", function, settings, outputs=("picture",), case=data, **inputs))
     return found
 
 

@@ -76,6 +76,7 @@ REPORT = {
     "title": str,
     "path": str,
     "figures": bool,
+    "videos": bool,
     "baselines": list[str],
     "bounds": list[str],
     "gains_of": list[str],

@@ -44,7 +44,7 @@ def run_batch(batch: Batch, show: bool = True) -> Path:
     config = batch.config
     Store(config["store"]["path"])  # a store that cannot be used is said before anything starts
     with server() as ready:
-        graph, works = work(batch.experiments, config["report"]["figures"])
+        graph, works = work(batch.experiments, config["report"])
         ready()
         cases = sum(len(experiment.cases) for experiment in batch.experiments)
         return Path(_flow(batch, graph, works, show)(config["report"]["name"], cases))

@@ -308,16 +308,20 @@ class Picture:
     caption: str
     png: np.ndarray | None = None
     svg: str = ""
+    webp: np.ndarray | None = None
 
     @property
     def suffix(self) -> str:
         """Of the picture's file."""
+        if self.webp is not None:
+            return "webp"
         return "svg" if self.png is None else "png"
 
     @property
     def data(self) -> bytes:
         """The content of the picture's file."""
-        return self.svg.encode() if self.png is None else self.png.tobytes()
+        pixels = self.png if self.webp is None else self.webp
+        return self.svg.encode() if pixels is None else pixels.tobytes()
 
 
 @dataclass(frozen=True)

@@ -83,14 +83,12 @@ def error_figure(
     shape = shape_of(test.points[0], test.faces)
     rows = []
     for i, (rank, frame) in enumerate(chosen.items()):
-        truth = _panel(
-            shape, cameras[i], test.points[frame], CLAY, [f"truth, {rank} frame", _place(test, frame)], theme
-        )
+        truth = panel(shape, cameras[i], test.points[frame], CLAY, [f"truth, {rank} frame", _place(test, frame)], theme)
         row = [truth]
         for name, points in results.items():
             rmse = math.sqrt(float(np.mean(errors[name][i] ** 2)))
             lines = [name, f"RMSE {rmse:.{_digits(top)}f} {'mm' if unit == 'mm' else '%'}"]
-            row.append(_panel(shape, cameras[i], points[frame], error_map(errors[name][i] / top), lines, theme))
+            row.append(panel(shape, cameras[i], points[frame], error_map(errors[name][i] / top), lines, theme))
         rows.append(np.hstack(row))
     sheet = np.vstack(rows)
     return render.finish(_row([sheet, _bar(len(sheet), error_map, top, unit, theme)], theme))
@@ -110,7 +108,7 @@ def skeleton_figure(
     points = canonical.points
     sides = [_cameras(points[None], azimuth + turn)[0] for turn in (0.0, 0.5 * np.pi)]
     glass = {"opacity": 0.16, "rim": 0.5}
-    pictures = [_panel(shape, side, points, CLAY * 0.9, lines, theme, joints, **glass) for side in sides]
+    pictures = [panel(shape, side, points, CLAY * 0.9, lines, theme, joints, **glass) for side in sides]
     if parts is None:
         return render.finish(_row(pictures, theme))
     names = [f"{len(skeleton.parents)} joints", *parts.names]
@@ -127,11 +125,11 @@ def parts_figure(
     points = canonical.points
     camera = _cameras(points[None], azimuth)[0]
     colours = part_colours(len(parts.names))
-    pictures = [_panel(shape, camera, points, follow @ colours, ["all parts"], theme)]
+    pictures = [panel(shape, camera, points, follow @ colours, ["all parts"], theme)]
     for p, name in enumerate(parts.names):
         mixed = CLAY + follow[:, p : p + 1] * (colours[p] - CLAY)
-        pictures.append(_panel(shape, camera, points, mixed, [name], theme))
-    return render.finish(_grid(pictures, 3, theme))
+        pictures.append(panel(shape, camera, points, mixed, [name], theme))
+    return render.finish(grid(pictures, 3, theme))
 
 
 def bones_figure(canonical: Canonical, skinning: Skinning, *, azimuth: float, theme: str = "light") -> np.ndarray:
@@ -144,9 +142,9 @@ def bones_figure(canonical: Canonical, skinning: Skinning, *, azimuth: float, th
     mixed = weights @ bone_colours(weights.shape[1])
     count = f"{weights.shape[1]} bones"
     pictures = [
-        _panel(shape, front, points, mixed, [count], theme),
-        _panel(shape, back, points, mixed, ["the other side"], theme),
-        _panel(shape, front, points, weight_map((shared - 1) / 3), ["bones that share a point"], theme),
+        panel(shape, front, points, mixed, [count], theme),
+        panel(shape, back, points, mixed, ["the other side"], theme),
+        panel(shape, front, points, weight_map((shared - 1) / 3), ["bones that share a point"], theme),
     ]
     bar = _bar(len(pictures[0]), weight_map, 4.0, "bones", theme, low=1.0)
     return render.finish(_row([*pictures, bar], theme))
@@ -171,9 +169,9 @@ def worn_figure(
         points = np.concatenate([body, worn])
         colours = np.repeat([CLAY, part_colours(1)[0]], [len(body), len(worn)], axis=0)
         camera = _cameras(points[None], WORN_FROM)[0]
-        pictures.append(_panel(shape, camera, points, colours, [caption], theme))
+        pictures.append(panel(shape, camera, points, colours, [caption], theme))
     tallest, widest = (max(p.shape[axis] for p in pictures) for axis in (0, 1))
-    return render.finish(_grid([_on_paper(p, tallest, widest, theme) for p in pictures], 4, theme))
+    return render.finish(grid([_on_paper(p, tallest, widest, theme) for p in pictures], 4, theme))
 
 
 def _on_paper(picture: np.ndarray, height: int, width: int, theme: str) -> np.ndarray:
@@ -206,7 +204,7 @@ def _cameras(frames: np.ndarray, azimuth: float) -> list[render.Camera]:
     return [replace(c, scale=widest.scale, distance=widest.distance) for c in cameras]
 
 
-def _panel(
+def panel(
     shape: Shape,
     camera: render.Camera,
     points: np.ndarray,
@@ -230,7 +228,7 @@ def _panel(
     return np.vstack([canvas, strip])
 
 
-def _grid(pictures: list[np.ndarray], columns: int, theme: str) -> np.ndarray:
+def grid(pictures: list[np.ndarray], columns: int, theme: str) -> np.ndarray:
     height, width = (n // render.SUPERSAMPLE for n in pictures[0].shape[:2])
     columns = min(columns, len(pictures))
     empty = [render.blank(width, height, theme)] * (-len(pictures) % columns)

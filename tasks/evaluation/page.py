@@ -143,10 +143,17 @@ def _short(checksum: object) -> str:
 
 def inline(picture: Picture) -> Markup:
     """The picture inside the page: a drawing as it is, pixels as a data URI."""
-    if picture.png is None:
+    if picture.suffix == "svg":
         return Markup(picture.svg)
-    content = picture.png.tobytes()
-    width, height = struct.unpack(">II", content[16:24])  # a PNG file begins with its size
-    data = base64.b64encode(content).decode()
-    tag = Markup('<img src="data:image/png;base64,{}" width="{}" height="{}" alt="{}">')
-    return tag.format(data, width, height, picture.caption)
+    width, height = size_of(picture)
+    data = base64.b64encode(picture.data).decode()
+    tag = Markup('<img src="data:image/{};base64,{}" width="{}" height="{}" alt="{}">')
+    return tag.format(picture.suffix, data, width, height, picture.caption)
+
+
+def size_of(picture: Picture) -> tuple[int, int]:
+    """Width and height of a picture of pixels, as its file begins with them: a PNG, or a WebP of several frames."""
+    content = picture.data
+    if picture.suffix == "png":
+        return struct.unpack(">II", content[16:24])
+    return tuple(1 + int.from_bytes(content[at : at + 3], "little") for at in (24, 27))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tasks.evaluation import figures, render
+from tasks.evaluation import figures, render, video
 from tasks.evaluation.views import views_figure
 from tasks.geometry import kinematics, measure
 from tasks.geometry.skinning import skin
@@ -18,6 +18,14 @@ def error_picture(test: Motion, canonical: Canonical, animations: dict[str, Anim
     pixels = figures.error_figure(test, shown, diagonal, focus=focus, azimuth=figures.azimuth_of(test))
     caption = f"{test.name}: vertex error on unseen clips, median and worst frame of {focus}"
     return Picture("errors", caption, _png(pixels))
+
+
+def clip_picture(test: Motion, canonical: Canonical, animations: dict[str, Animation], *, focus: str) -> Picture:
+    """Truth and methods side by side in an unseen clip, as a looping video."""
+    shown = {label: animation.points for label, animation in animations.items()}
+    azimuth, diagonal = figures.azimuth_of(test), measure.diagonal(canonical.points)
+    data, caption = video.clip_video(test, shown, diagonal, focus=focus, azimuth=azimuth)
+    return Picture("video", caption, webp=np.frombuffer(data, np.uint8))
 
 
 def skeleton_picture(train: Motion, canonical: Canonical, skeleton: Skeleton, parts: Parts) -> Picture:

@@ -109,9 +109,10 @@ def read_figures(folder: Path, provenance: Mapping[str, Any]) -> dict[str, Pictu
     for name, caption in provenance["figures"].items():
         data = (folder / name).read_bytes()
         if name.endswith(".svg"):
-            found[name] = Picture(name, caption, None, data.decode())
+            found[name] = Picture(name, caption, svg=data.decode())
         else:
-            found[name] = Picture(name, caption, np.frombuffer(data, np.uint8))
+            suffix = name.rpartition(".")[2]
+            found[name] = Picture(name, caption, **{suffix: np.frombuffer(data, np.uint8)})
     return found
 
 

@@ -6,11 +6,13 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
-from scipy.sparse import csr_matrix
+from scipy.spatial import cKDTree
 
 from tasks.errors import InputError
 from tasks.geometry import rotations
-from tasks.values import Animation, Capture, Gaussians, Motion, Reconstruction, Skinning
+from tasks.values import Animation, Capture, Gaussians, Reconstruction
+
+NEIGHBOURS = 8  # whose motion says how a Gaussian turns
 
 
 def render_views(
@@ -47,44 +49,40 @@ def at_frame(reconstruction: Reconstruction, frame: int) -> Gaussians:
     return replace(rest, means=reconstruction.points[f], scales=scales, opacities=opacities, quaternions=quaternions)
 
 
-def pose_gaussians(
-    reconstruction: Reconstruction, animation: Animation, motion: Motion, skinning: Skinning
-) -> Reconstruction:
-    """The Gaussians in the poses of an animation, frame for frame of the motion that it was made for.
+def pose_gaussians(reconstruction: Reconstruction, animation: Animation) -> Reconstruction:
+    """The Gaussians in the poses of an animation, frame for frame.
 
-    animation.points: (F, N, 3) of the reconstruction's N Gaussians. Where they are stretched, each turns as the bones
-    that carry it: the rotation nearest to its blended transform. What the fit found for single frames (scaling,
-    opacity) is left behind; times run evenly from 0 to 1. Raises InputError where the points are not the Gaussians.
+    animation.points: (F, N, 3) of the reconstruction's N Gaussians. Where they are stretched, each turns as its
+    neighbours do round it, which holds for every method, with bones or without. What the fit found for single frames
+    (scaling, opacity) is left behind; the frames are one clip, times run evenly from 0 to 1. Raises InputError where
+    the points are not the Gaussians.
     """
-    expected, found = reconstruction.points.shape[1], animation.points.shape[1]
-    if expected != found:
-        raise InputError(
-            "pose_gaussians", expected=f"a point for each of {expected} Gaussians", found=f"{found} points"
-        )
-    turned = None
-    if reconstruction.gaussians.quaternions is not None and animation.bones is not None:
-        turned = _turned(skinning.weights, animation.bones)
+    rest, count = reconstruction.gaussians, len(animation.points)
+    if animation.points.shape[1] != len(rest.means):
+        found = f"{animation.points.shape[1]} points"
+        raise InputError("pose_gaussians", expected=f"a point for each of {len(rest.means)} Gaussians", found=found)
     return replace(
         reconstruction,
         points=animation.points,
-        rotations=turned,
+        rotations=None if rest.quaternions is None else _turned(rest.means, animation.points),
         scaling=None,
         opacity=None,
-        times=np.linspace(0.0, 1.0, len(animation.points)).astype(np.float32),
-        fps=motion.fps,
-        clip_start=motion.clip_start,
-        clip_names=motion.clip_names,
-        rig=motion.rig,
+        times=np.linspace(0.0, 1.0, count).astype(np.float32),
+        clip_start=np.array([0, count], np.int64),
+        clip_names=("posed",),
+        rig=None,
     )
 
 
-def _turned(weights: np.ndarray, bones: np.ndarray) -> np.ndarray:
-    """Quaternions (F, N, 4) of the rotations nearest to the blended bones. weights: (N, B); bones: (F, B, 3, 4)."""
-    sparse = csr_matrix(np.asarray(weights, np.float64))
-    out = np.empty((len(bones), len(weights), 4), np.float32)
-    for f, bone in enumerate(bones):
-        blended = sparse @ bone[:, :, :3].reshape(-1, 9).astype(np.float64)
-        out[f] = rotations.to_quaternion(rotations.project_so3(blended.reshape(-1, 3, 3)))
+def _turned(rest: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Quaternions (F, N, 4) of the rotations that best carry each point's neighbourhood from rest to every frame."""
+    near = cKDTree(rest).query(rest, min(NEIGHBOURS + 1, len(rest)))[1][:, 1:]  # without the point itself
+    before = (rest[near] - rest[:, None]).astype(np.float64)
+    out = np.empty((*points.shape[:2], 4), np.float32)
+    for f, posed in enumerate(points):
+        after = (posed[near] - posed[:, None]).astype(np.float64)
+        turns = rotations.project_so3(np.einsum("nki,nkj->nij", after, before))
+        out[f] = rotations.to_quaternion(turns)
     return out
 
 

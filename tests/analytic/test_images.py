@@ -13,7 +13,7 @@ from torch import nn
 from tasks.errors import InputError
 from tasks.evaluation import images, lpips
 from tasks.reconstruction.views import at_frame, pose_gaussians, render_views
-from tasks.values import Animation, Capture, Gaussians, Motion, Reconstruction, Skinning
+from tasks.values import Animation, Capture, Gaussians, Reconstruction
 
 PICTURE = np.random.default_rng(0).random((40, 50, 3))
 
@@ -235,31 +235,23 @@ def test_factors_of_a_frame():
     assert np.array_equal(posed.means, made.points[1])
 
 
-def test_posed_gaussians_turn_with_their_bones():
-    """One bone turns a stretched body by 90 degrees: rendered from a camera that turns along, nothing changes."""
+def test_posed_gaussians_turn_with_what_is_round_them():
+    """All is turned by 90 degrees: from a camera that turns along nothing changes."""
     made = reconstruction(frames=1, stretched=True)
     turn = np.float32([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    bones = np.concatenate([turn, np.zeros((3, 1), np.float32)], 1)[None, None]
-    rest = made.points[0]
-    motion = Motion("toy", rest[None] @ turn.T, None, np.array([0, 1]), ("turned",), 25.0)
-    skinning = Skinning(rest, np.ones((30, 1), np.float32), bones, np.zeros(0))
-    posed = pose_gaussians(made, Animation(motion.points, bones=bones), motion, skinning)
-    assert posed.clip_names == ("turned",)
+    posed = pose_gaussians(made, Animation(made.points @ turn.T))
+    assert posed.clip_start.tolist() == [0, 1]
     seen = capture(1)
     view = seen.view.copy()
     view[0, :3, :3] = turn.T
-    still, turned = (
-        render_views(made, seen, backend="numba"),
-        render_views(posed, replace(seen, view=view), backend="numba"),
-    )
+    along = replace(seen, view=view)
+    still, turned = render_views(made, seen, backend="numba"), render_views(posed, along, backend="numba")
     assert np.abs(still.images.astype(int)[..., 3] - turned.images[..., 3]).max() <= 1
-    unturned = render_views(replace(posed, rotations=None), replace(seen, view=view), backend="numba")
+    unturned = render_views(replace(posed, rotations=None), along, backend="numba")
     assert np.abs(still.images.astype(int)[..., 3] - unturned.images[..., 3]).max() > 30
 
 
 def test_poses_of_other_gaussians():
     made = reconstruction(1)
-    motion = Motion("toy", made.points[:, :9], None, np.array([0, 1]), ("a",), 25.0)
-    skinning = Skinning(made.points[0], np.ones((30, 1)), np.zeros((1, 1, 3, 4)), np.zeros(0))
     with pytest.raises(InputError, match="expected a point for each of 30 Gaussians, found 9 points"):
-        pose_gaussians(made, Animation(motion.points), motion, skinning)
+        pose_gaussians(made, Animation(made.points[:, :9]))

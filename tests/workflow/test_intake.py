@@ -1,0 +1,75 @@
+"""Which stage feeds which where Gaussians come first: nothing of the unseen frames may reach what is learned."""
+
+from __future__ import annotations
+
+import pytest
+
+from flows import config
+from flows.graph import Graph, Node
+from flows.pipeline import Planned, plan
+from tasks.errors import InputError
+
+TABLE4 = ["+experiment=table4", "sweep.datasets=[creature_figure]"]
+
+
+def planned(overrides: list[str]) -> dict[str, Planned]:
+    graph = Graph()
+    cases = config.expand(overrides)
+    return {case.method: plan(case, graph) for case in cases}
+
+
+def behind(node: Node) -> set[tuple[str, str]]:
+    """(stage, output) of all that a node is made from."""
+    found: set[tuple[str, str]] = set()
+    pending = [node]
+    while pending:
+        for value in pending.pop().inputs.values():
+            for upstream, output in value.values() if isinstance(value, dict) else [value]:
+                if (upstream.stage, output) not in found:
+                    found.add((upstream.stage, output))
+                    pending.append(upstream)
+    return found
+
+
+def test_no_unseen_frame_reaches_gaussians_bones_skeleton_or_database():
+    case = planned(TABLE4)["partmm"]
+    for name in ("reconstruction", "skinning", "skeleton", "poses", "parts"):
+        assert ("split", "test") not in behind(case.nodes[name][0])
+    assert ("split", "train") in behind(case.nodes["reconstruction"][0])
+    assert ("scene", "views") not in behind(case.nodes["reconstruction"][0])
+
+
+def test_all_methods_are_judged_on_the_same_views():
+    cases = planned(TABLE4)
+    seen = {(node.id, output) for node, output in (case.nodes["seen"] for case in cases.values())}
+    assert len(seen) == 1
+    assert cases["partmm"].nodes["reconstruction"] == cases["lbs"].nodes["reconstruction"]
+    best = cases["ground_truth"].nodes["reconstruction"][0]
+    assert ("split", "test") in behind(best)
+    assert ("split", "train") not in behind(best)
+
+
+def test_gaussian_bones_are_bobs_alone():
+    cases = planned(TABLE4)
+    function = {
+        method: case.nodes["skinning"][0].function for method, case in cases.items() if "skinning" in case.nodes
+    }
+    assert function["bob"] == "tasks.bones.gaussian:gaussian_bones"
+    assert {f for method, f in function.items() if method != "bob"} == {"tasks.bones.ssdr:ssdr"}
+
+
+def test_images_without_a_fit_are_one_clear_line():
+    graph = Graph()
+    (case,) = config.expand(["dataset=dnerf", "dataset.path=nowhere", "sweep.datasets=null", "sweep.methods=null"])
+    with pytest.raises(InputError, match="reconstruction=cpu"):
+        plan(case, graph)
+
+
+def test_captures_go_down_the_same_stages():
+    words = ["dataset=dnerf", "dataset.path=nowhere", "reconstruction=cpu", "sweep.datasets=null"]
+    graph = Graph()
+    (case,) = config.expand([*words, "sweep.methods=[partmm]"])
+    nodes = plan(case, graph).nodes
+    assert ("gaussians", "reconstruction") in behind(nodes["skinning"][0])
+    (case,) = config.expand([*words, "sweep.methods=[gaussians]"])
+    assert [node.stage for node in plan(case, Graph()).metrics] == ["evaluate"]

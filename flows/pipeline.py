@@ -63,6 +63,13 @@ def plan(case: Case, graph: Graph) -> Planned:
 def _benchmark(case: Case, name: str, add) -> Planned:
     """A stage of ours, timed in one stage of its own, beside a peer where there is one."""
     config, function = case.config, schema.BENCHMARKS[case.config["pipeline"]]
+    if config["pipeline"] == "benchmark_matching":
+        nodes = _rig(config, add)
+        nodes |= _database(add, nodes)
+        own = {"matching": schema.arguments(schema.MATCHING, config["animate"], config["seed"])}
+        inputs = {"training": _training(nodes, nodes["train"]), "query": nodes["query"]}
+        measured = add("benchmark", function, config["benchmark"] | own, "metrics", **inputs)
+        return Planned(case, name, (measured,), nodes)
     nodes = intake.data(config, add)
     if config["pipeline"] != "benchmark_skeleton":
         stages = {"clustering": schema.CLUSTER, "decomposition": schema.SSDR}
@@ -99,10 +106,18 @@ def _rig(config: dict, add) -> dict[str, Output]:
 
 def _animation(config: dict, add, nodes: dict[str, Output]) -> dict[str, Output]:
     """Stage 4: the database, and the method's answer to the unseen poses."""
-    inputs = {n: nodes[n] for n in ("train", "skinning", "poses")}
-    database = add("database", schema.DATABASE, {}, "database", **inputs)["database"]
-    found = {"database": database}
+    found = _database(add, nodes)
     return found | {"animation": _answer(config, add, nodes | found, nodes["train"], nodes["query"], nodes["test"])}
+
+
+def _database(add, nodes: dict[str, Output]) -> dict[str, Output]:
+    inputs = {n: nodes[n] for n in ("train", "skinning", "poses")}
+    return {"database": add("database", schema.DATABASE, {}, "database", **inputs)["database"]}
+
+
+def _training(nodes: dict[str, Output], motion: Output) -> dict[str, Output]:
+    """All that a method may learn from."""
+    return {"motion": motion, **{n: nodes[n] for n in ("canonical", "skinning", "skeleton", "parts", "database")}}
 
 
 def _answer(config: dict, add, nodes: dict[str, Output], motion: Output, query: Output, truth: Output) -> Output:
@@ -110,9 +125,8 @@ def _answer(config: dict, add, nodes: dict[str, Output], motion: Output, query: 
     method = schema.animate_function(config["animate"]["function"])
     if method == schema.FLOOR:
         return add("animate", method, {}, "animation", unseen=truth, skinning=nodes["skinning"])["animation"]
-    training = {n: nodes[n] for n in ("canonical", "skinning", "skeleton", "parts", "database")}
-    training |= {"motion": motion}
-    return add("animate", method, config["animate"], "animation", training=training, query=query)["animation"]
+    inputs = {"training": _training(nodes, motion), "query": query}
+    return add("animate", method, config["animate"], "animation", **inputs)["animation"]
 
 
 def _left_out(case: Case, add, nodes: dict[str, Output]) -> list[Node]:

@@ -41,6 +41,10 @@ BENCHMARKS = {
         ("points_exponent", "frames_exponent", "points_count", "frames_count", "seconds", "memory"),
         {},
     ),
+    "benchmark_matching": (
+        ("fps", "p99_ms", "clip_fps", "query_ms", "recall_at_7", "build_seconds", "memory"),
+        {},
+    ),
     "benchmark_skeleton": (
         ("time_ratio", "cpu_ratio", "seconds", "peer_seconds", "memory", "peer_memory"),
         {

@@ -44,6 +44,7 @@ EVALUATE_VIEWS = "tasks.evaluation.images:evaluate_views"
 EVALUATE_PATHS = "tasks.evaluation.paths:evaluate_paths"
 EVALUATE = "tasks.evaluation.metrics:evaluate"
 EVALUATE_RIG = "tasks.evaluation.rig:evaluate_rig"
+MATCHING = "tasks.methods.partmm:animate"
 FLOOR = "tasks.bones.refit:compression_floor"
 LEAVE_OUT = "tasks.motion.left_out:leave_out"
 EVALUATE_LEFT_OUT = "tasks.evaluation.left_out:evaluate_left_out"
@@ -52,6 +53,7 @@ BENCHMARKS = {
     "benchmark_bones": "tasks.benchmarks.bones:benchmark_bones",
     "benchmark_skeleton": "tasks.benchmarks.skeleton:benchmark_skeleton",
     "scale_bones": "tasks.benchmarks.scale:scale_bones",
+    "benchmark_matching": "tasks.benchmarks.matching:benchmark_matching",
 }
 GARMENTS = {
     "body": "tasks.garments.body:anny_body",
@@ -86,7 +88,12 @@ REPORT = {
 }
 LEFT_OUT = {"left_out": int, "left_out_of": list[str] | None}
 FROM_RUN = {"seed"}  # arguments that come from the top of the config
-OF_STAGES = {"clustering", "decomposition", "tracing"}  # a benchmark's arguments that are whole stages' settings
+OF_STAGES = {
+    "clustering",
+    "decomposition",
+    "tracing",
+    "matching",
+}  # a benchmark's arguments that are whole stages' settings
 RENAMED = {"lambda_": "lambda"}  # Python keywords that are the field's names in the config
 
 
@@ -167,14 +174,16 @@ def _method(config: dict) -> dict[str, object]:
     labels = {"name": str, "label": str}
     if config["pipeline"] == "make_garments":
         return {"animate": labels, "make": _make(config["make"])}
-    benchmark = BENCHMARKS.get(str(config["pipeline"]))
+    benchmark, own = BENCHMARKS.get(str(config["pipeline"])), {}
     if benchmark:
-        own = {n: t for n, t in settings(benchmark).items() if n not in OF_STAGES}
-        return {"animate": labels, "benchmark": own}
+        own = {"benchmark": {n: t for n, t in settings(benchmark).items() if n not in OF_STAGES}}
+        if config["pipeline"] != "benchmark_matching":
+            return {"animate": labels} | own
     if config["pipeline"] == "reconstruct":
         return {"animate": labels}
     function = animate_function(config["animate"].get("function", ""))
-    return {"animate": labels | {"function": str, **settings(function)}, "parts": settings(PARTS)}
+    method = {"animate": labels | {"function": str, **settings(function)}, "parts": settings(PARTS)}
+    return method | own
 
 
 def _make(make: dict) -> dict[str, object]:

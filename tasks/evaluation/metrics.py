@@ -25,7 +25,9 @@ class Metric:
     text: one line for readers; digits: decimals in tables, or None for three significant ones."""
 
     label: str
-    kind: Literal["length", "speed", "percent", "ratio", "count", "decibel", "hours", "seconds", "memory"]
+    kind: Literal[
+        "length", "speed", "percent", "ratio", "count", "decibel", "hours", "seconds", "milliseconds", "rate", "memory"
+    ]
     better: Literal["lower", "higher", "one", "none"]
     text: str
     digits: int | None = None
@@ -96,6 +98,12 @@ METRICS: dict[str, Metric] = {
     "depth_995": Metric("depth", "length", "lower", "99.5 % of the cloth is no deeper inside; negative: outside", 2),
     "strain_p99_pct": Metric("strain", "percent", "lower", "99 % of the edges are strained by no more", 2),
     "speed_max": Metric("fastest", "speed", "none", "the greatest speed of any vertex"),
+    "fps": Metric("poses", "rate", "higher", "poses a second, one after another, no look-ahead, to posed points", 0),
+    "p99_ms": Metric("99 % within", "milliseconds", "lower", "time that 99 % of these poses stay under", 2),
+    "clip_fps": Metric("whole clips", "rate", "higher", "frames a second when clips are matched as a whole", 0),
+    "query_ms": Metric("query", "milliseconds", "lower", "search for one new pose, all parts, largest database", 2),
+    "recall_at_7": Metric("recall at 7", "ratio", "higher", "share of the 7 truly nearest windows that are found", 3),
+    "build_seconds": Metric("build", "seconds", "lower", "seconds to make a database of 10,000 frames ready", 2),
     "curve_leaves": Metric("leaves", "count", "none", "ends of the curve skeleton", 0),
     "curve_junctions": Metric("junctions", "count", "none", "nodes where three or more branches meet", 0),
     "curve_cycles": Metric("cycles", "count", "lower", "loops of the curve skeleton", 0),
@@ -116,6 +124,8 @@ _FIXED_UNITS = {
     "decibel": "dB",
     "hours": "h",
     "seconds": "s",
+    "milliseconds": "ms",
+    "rate": "1/s",
     "memory": "MB",
 }
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal
 
@@ -10,8 +10,8 @@ import numpy as np
 
 from tasks.errors import InputError
 from tasks.geometry import rigid
-from tasks.motion.blending import Sources, blend, gather, strongest
-from tasks.motion.posed import Posed, relative
+from tasks.motion.blending import PartMotion, Sources, blend, gather, strongest
+from tasks.motion.posed import Posed
 from tasks.motion.projection import project
 from tasks.motion.query import check_poses
 from tasks.motion.regression import bone_radii, from_numbers, to_numbers
@@ -59,57 +59,106 @@ class Matched:
     distance: np.ndarray
 
 
-def match(training: Training, query: Poses, way: Way) -> Matched:
-    """Bones for the query poses, matched and blended part by part (GaussiAnimate 3.3, eq. 7-10, alg. 1).
+@dataclass(frozen=True)
+class PartStore:
+    """What a part's blend takes from the database. follows: (M,) its bones; affinity: (M,) how much they follow;
+    values: (F, M, 3, 4) in the part's frame; motion: its joints in the training frames."""
 
-    Raises InputError for poses of another skeleton, matrices that are no rotations and training clips too short.
-    """
-    check_poses(query, training.skeleton, "query")
+    follows: np.ndarray
+    affinity: np.ndarray
+    values: np.ndarray
+    motion: PartMotion
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A database ready to be matched. known: the training poses; parts: one store each; keep: (B,) share of the matched
+    residuals to believe, or None for all of it."""
+
+    known: Posed
+    way: Way
+    parts: tuple[PartStore, ...]
+    keep: np.ndarray | None = None
+
+
+def prepare(training: Training, way: Way) -> Prepared:
+    """The database as queries need it. Raises InputError where every training clip is shorter than a patch."""
     known = Posed(training, training.database.poses)
     longest = int(np.diff(known.poses.clip_start).max())
     if longest < way.patch:
         expected = f"at most the {longest} frames of the longest training clip"
         raise InputError("animate.patch", expected=expected, found=str(way.patch))
     values = known.encode(training.database.bones, way.represent)
-    keep = _reliability(training, known, values, way) if way.shrink else None
-    done = []
+    parts = []
+    for part, affinity in enumerate(training.parts.affinity):
+        follows = np.flatnonzero(affinity > 0)
+        mine = known.to_part(values[:, follows], part, way.represent)
+        parts.append(PartStore(follows, affinity[follows], mine, known.part_motion(part, way.represent)))
+    ready = Prepared(known, way, tuple(parts))
+    return replace(ready, keep=_reliability(ready, values)) if way.shrink else ready
+
+
+def match(training: Training, query: Poses, way: Way) -> Matched:
+    """Bones for the query poses, matched and blended part by part (GaussiAnimate 3.3, eq. 7-10, alg. 1).
+
+    Raises InputError for poses of another skeleton, matrices that are no rotations and training clips too short.
+    """
+    check_poses(query, training.skeleton, "query")
+    return match_prepared(prepare(training, way), query)
+
+
+def match_prepared(ready: Prepared, query: Poses) -> Matched:
+    """The same with a database that is ready, for poses that were checked."""
+    done, way = [], ready.way
     for clip in range(len(query.clip_start) - 1):
-        asked = Posed(training, _clip(query, clip, way.patch))
-        frames, sources, distance = _match_clip(asked, known, values, way)
-        if keep is not None:
-            frames = _shrunk(frames, keep)
+        asked = Posed(ready.known.training, _clip(query, clip, way.patch), ready.known)
+        frames, sources, distance = _match_clip(asked, ready)
         length = int(query.clip_start[clip + 1] - query.clip_start[clip])
-        done.append([x[:length] for x in (asked.decode(frames, way.represent), sources, distance)])
+        done.append([x[:length] for x in (asked.decode(believed(ready, frames), way.represent), sources, distance)])
     bones, sources, distance = (np.concatenate(x) for x in zip(*done, strict=True))
     return Matched(bones.astype(np.float32), sources, distance.astype(np.float32))
 
 
-def _match_clip(
-    asked: Posed, known: Posed, values: np.ndarray, way: Way, skip: int | None = None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _match_clip(asked: Posed, ready: Prepared, skip: int | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """One clip: frames of bones (F, B, 3, 4), sources (F, P, k), distance (F, P). skip: a training clip left out."""
-    frames = len(asked.world)
+    frames, way, known = len(asked.world), ready.way, ready.known
     lengths = np.delete(np.diff(known.poses.clip_start), [] if skip is None else skip)
     strides = _strides(min(frames, int(lengths.max())), way.patch, way.levels)
-    bones = np.zeros((frames, *values.shape[1:]))
-    sources, distance = [], []
-    for part in range(len(asked.training.parts.names)):
+    rows, distance = [], []
+    for part in range(len(ready.parts)):
         keys = asked.keys(part, way.dynamics), known.keys(part, way.dynamics)
         found = nearest_windows(*keys, k=way.k, patch=way.patch, strides=strides, skip=skip)
-        row = gather(found, strides, patch=way.patch, lambda_=way.lambda_, temperature=way.temperature)
-        _add_part(bones, part, row, values, asked, known, way)
-        sources.append(strongest(row, way.k))
+        rows.append(gather(found, strides, patch=way.patch, lambda_=way.lambda_, temperature=way.temperature))
         distance.append(_per_frame(found.distance[-1, :, 0], frames, way.patch))
-    return rigid.make(project(bones[..., :3]), bones[..., 3]), np.stack(sources, 1), np.stack(distance, 1)
+    sources = np.stack([strongest(row, way.k) for row in rows], 1)
+    return merged(asked, ready, rows), sources, np.stack(distance, 1)
 
 
-def _reliability(training: Training, known: Posed, values: np.ndarray, way: Way) -> np.ndarray:
+def merged(asked: Posed, ready: Prepared, rows: list[Sources]) -> np.ndarray:
+    """Every part's blend of its sources, (F, B, 3, 4): parts averaged by affinity, projected to rigid frames once."""
+    represent = ready.way.represent
+    align = ready.way.align and represent != "residual"
+    bones = np.zeros((len(asked.world), len(asked.centres), 3, 4))
+    for part, (row, store) in enumerate(zip(rows, ready.parts, strict=True)):
+        mixed = blend(row, store.values, asked.part_motion(part, represent), store.motion, align=align)
+        placed = asked.from_part(mixed, part, represent)
+        bones[:, store.follows] += store.affinity[:, None, None] * placed
+    return rigid.make(project(bones[..., :3]), bones[..., 3])
+
+
+def believed(ready: Prepared, frames: np.ndarray) -> np.ndarray:
+    """Residual frames of bones shrunk to what proved right."""
+    return frames if ready.keep is None else from_numbers(to_numbers(frames) * ready.keep[:, None])
+
+
+def _reliability(ready: Prepared, values: np.ndarray) -> np.ndarray:
     """How much of a bone's matched residual to believe, (B,) in [0, 1].
 
     Every training clip is matched against the others; the share is what brings the matched residuals closest to the
     true ones in the least-squares sense. One clip alone, or clips too short to be matched, leave it at one.
     """
-    poses, patch = training.database.poses, way.patch
+    training, patch = ready.known.training, ready.way.patch
+    poses = training.database.poses
     lengths = np.diff(poses.clip_start)
     radius = bone_radii(training.skinning.rest, training.skinning.weights)
     unit = np.repeat([radius, np.ones_like(radius)], 3, axis=0).T
@@ -117,28 +166,11 @@ def _reliability(training: Training, known: Posed, values: np.ndarray, way: Way)
     for clip, (a, b) in enumerate(pairwise(poses.clip_start)):
         if len(lengths) < 2 or np.delete(lengths, clip).max() < patch:
             continue
-        asked = Posed(training, _clip(poses, clip, patch))
-        made = to_numbers(_match_clip(asked, known, values, way, skip=clip)[0])[: b - a] * unit
+        asked = Posed(training, _clip(poses, clip, patch), ready.known)
+        made = to_numbers(_match_clip(asked, ready, skip=clip)[0])[: b - a] * unit
         agree += (made * to_numbers(values[a:b]) * unit).sum((0, 2))
         size += (made**2).sum((0, 2))
     return np.where(size > 0, np.clip(agree / np.maximum(size, 1e-30), 0.0, 1.0), 1.0)
-
-
-def _shrunk(frames: np.ndarray, keep: np.ndarray) -> np.ndarray:
-    return from_numbers(to_numbers(frames) * keep[:, None])
-
-
-def _add_part(
-    bones: np.ndarray, part: int, row: Sources, values: np.ndarray, asked: Posed, known: Posed, way: Way
-) -> None:
-    """Adds one part's blend to the bones that follow it, (F, B, 3, 4) in place, weighted by affinity."""
-    affinity = asked.training.parts.affinity[part]
-    follows = np.flatnonzero(affinity > 0)
-    mine = relative(values[:, follows], known.part_frame(part, way.represent))
-    align = way.align and way.represent != "residual"
-    joints = asked.part_motion(part, way.represent), known.part_motion(part, way.represent)
-    mixed = rigid.compose(asked.part_frame(part, way.represent)[:, None], blend(row, mine, *joints, align=align))
-    bones[:, follows] += affinity[follows, None, None] * mixed
 
 
 def _per_frame(distance: np.ndarray, frames: int, patch: int) -> np.ndarray:

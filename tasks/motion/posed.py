@@ -31,11 +31,12 @@ class Posed:
     rotations differ.
     """
 
-    def __init__(self, training: Training, poses: Poses) -> None:
-        skeleton, skinning = training.skeleton, training.skinning
+    def __init__(self, training: Training, poses: Poses, like: Posed | None = None) -> None:
+        """like: other poses of the same training, whose centroids and affinities serve again."""
+        skeleton = training.skeleton
         self.training, self.poses = training, poses
-        self.root = model_root(skeleton)
-        self.inner = subtree(skeleton.parents)[self.root]
+        self.root = like.root if like else model_root(skeleton)
+        self.inner = like.inner if like else subtree(skeleton.parents)[self.root]
         self.world = kinematics.forward(
             np.asarray(skeleton.parents),
             skeleton.joints.astype(np.float64),
@@ -43,7 +44,9 @@ class Posed:
             poses.translations.astype(np.float64),
         )
         self.model = relative(self.world, self.world[:, self.root])
-        self.centres = centroids(skinning.rest, skinning.weights)
+        self.centres = like.centres if like else centroids(training.skinning.rest, training.skinning.weights)
+        if like:
+            self.affinity = like.affinity
         self._keys: dict[tuple[int, float], Keys] = {}
 
     @cached_property
@@ -60,9 +63,14 @@ class Posed:
         return moving * (DYNAMICS / np.array([1.0, size, size, 1.0]))[:, None]
 
     @cached_property
+    def affinity(self) -> np.ndarray:
+        """(B, J) how much each free-form bone follows each joint."""
+        return bone_affinity(self.training.skinning.weights, self.training.skeleton.weights)
+
+    @cached_property
     def predicted(self) -> np.ndarray:
         """(F, B, 3, 4) where skinning of the skeleton would carry the bones' frames."""
-        affinity = bone_affinity(self.training.skinning.weights, self.training.skeleton.weights)
+        affinity = self.affinity
         frames, joints = self.world.shape[:2]
         blended = (affinity @ self.world.reshape(frames, joints, 12)).reshape(frames, len(affinity), 3, 4)
         return rigid.make(project(blended[..., :3]), rigid.apply(blended, self.centres))
@@ -83,17 +91,25 @@ class Posed:
             self._keys[part, dynamics] = Keys(turns, extra.astype(np.float32), self.poses.clip_start)
         return self._keys[part, dynamics]
 
-    def part_frame(self, part: int, represent: str) -> np.ndarray:
-        """(F, 3, 4) the frame, seen from the model's root, that a part's bones are stored in."""
-        root = int(self.training.parts.roots[part])
-        return self.model[:, root] if represent == "part" else np.broadcast_to(np.eye(3, 4), self.world[:, 0].shape)
+    def to_part(self, transforms: np.ndarray, part: int, represent: str) -> np.ndarray:
+        """Transforms in the model, (F, X, 3, 4), seen from where the part's bones are stored: from its root joint for
+        ``part``, else from the model's own."""
+        return relative(transforms, self._part_root(part)) if represent == "part" else transforms
+
+    def from_part(self, transforms: np.ndarray, part: int, represent: str) -> np.ndarray:
+        """The inverse of :meth:`to_part`."""
+        return rigid.compose(self._part_root(part)[:, None], transforms) if represent == "part" else transforms
 
     def part_motion(self, part: int, represent: str) -> PartMotion:
         """Joints and anchor of a part, seen from its frame."""
         root = int(self.training.parts.roots[part])
-        seen = relative(self.model, self.part_frame(part, represent))
-        turns = to_quaternion(seen[:, self.training.parts.joints[part] & self.inner, :, :3])
-        return PartMotion(turns, rigid.apply(seen[:, root], self.training.skeleton.joints[root].astype(np.float64)))
+        joints = self.training.parts.joints[part] & self.inner
+        turns = to_quaternion(self.to_part(self.model[:, joints], part, represent)[..., :3])
+        placed = self.to_part(self.model[:, root, None], part, represent)[:, 0]
+        return PartMotion(turns, rigid.apply(placed, self.training.skeleton.joints[root].astype(np.float64)))
+
+    def _part_root(self, part: int) -> np.ndarray:
+        return self.model[:, int(self.training.parts.roots[part])]
 
     def encode(self, transforms: np.ndarray, represent: str) -> np.ndarray:
         """Transforms of bones on canonical points -> frames seen from the model's root or, as ``residual``, from where

@@ -6,6 +6,7 @@ reads its settings from there.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 
 from flows import intake, schema
@@ -174,11 +175,29 @@ def _skeleton(settings: dict, add, train, test, canonical, skinning) -> dict[str
 
 def plan_files(planned: list[Planned], graph: Graph) -> list[Output]:
     """The files that the report brings along."""
+    found = [output for p in planned if "skinning" in p.nodes for output in _exports(p, graph)]
     made = {p.case.config["dataset"]["garment"]: p for p in planned if "garment_file" in p.nodes}
-    if not made:
-        return []
-    every = next(iter(made.values())).case.config["make"]["every"]
-    return plan_manifest({garment: p.nodes for garment, p in made.items()}, every, graph)
+    if made:
+        every = next(iter(made.values())).case.config["make"]["every"]
+        found += plan_manifest({garment: p.nodes for garment, p in made.items()}, every, graph)
+    return found
+
+
+def _exports(planned: Planned, graph: Graph) -> list[Output]:
+    """A case's character for other programs: the method's answer to unseen poses, or the training frames."""
+    nodes, seed = planned.nodes, planned.case.seed
+    name = re.sub(r"[^A-Za-z0-9.-]+", "_", planned.name) + (f"_seed{seed}" if seed else "")
+    moving = {"motion": nodes["train"], "poses": nodes["poses"]}
+    if "animation" in nodes:
+        moving = {"motion": nodes["test"], "poses": nodes["query"], "animation": nodes["animation"]}
+    values = {n: nodes[n] for n in ("canonical", "skinning", "skeleton")} | moving
+    found = []
+    for kind in planned.case.config["export"]["formats"]:
+        function = schema.EXPORTS[kind]
+        inputs = {n: values[n] for n in signature(function)[0] if n in values}
+        node = graph.add("export", function, {"name": name}, outputs=("files",), case=planned.name, **inputs)
+        found.append(node["files"])
+    return found
 
 
 def plan_pictures(planned: list[Planned], graph: Graph) -> list[Node]:

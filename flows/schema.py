@@ -68,6 +68,12 @@ GARMENTS = {
     "manifest": "tasks.garments.manifest:manifest",
     "picture": "tasks.evaluation.pictures:garment_picture",
 }
+EXPORTS = {
+    "glb": "tasks.export.character:bones_glb",
+    "skeleton_glb": "tasks.export.character:skeleton_glb",
+    "bvh": "tasks.export.character:skeleton_bvh",
+    "npz": "tasks.export.character:points_npz",
+}
 PER_CLIP = ("clip", "cycles", "turn", "slow")  # settings of a motion that differ from clip to clip
 PER_RUN = ("fps", "frames")  # settings of garments that several stages share
 
@@ -150,6 +156,7 @@ def schema(config: dict, sweep: dict[str, object]) -> dict[str, object]:
         **_method(config),
         "evaluate": settings(EVALUATE) | settings(EVALUATE_RIG) | LEFT_OUT,
         "report": REPORT,
+        "export": {"formats": list[Literal["glb", "skeleton_glb", "bvh", "npz"]]},
         "store": {"path": str},
         "memory": {"max_gb": float | None},
         "runner": {"kind": Literal["threads", "processes"], "workers": int},

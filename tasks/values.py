@@ -333,11 +333,25 @@ class Cloth:
 
 
 @dataclass(frozen=True)
-class File:
-    """A file that a report brings along. path: where it lies in the report's folder; content: (bytes,) uint8."""
+class Files:
+    """Files that a report brings along, one or more. paths: n, where they lie in the report's folder; content: (bytes,)
+    uint8, one after another; start: (n + 1,) int64, where each begins."""
 
-    path: str
+    paths: tuple[str, ...]
     content: np.ndarray
+    start: np.ndarray
+
+    @staticmethod
+    def of(files: dict[str, bytes]) -> Files:
+        """From the bytes by their paths."""
+        sizes = [len(data) for data in files.values()]
+        content = np.frombuffer(b"".join(files.values()), np.uint8)
+        return Files(tuple(files), content, np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64))
+
+    def items(self) -> list[tuple[str, bytes]]:
+        """Paths and bytes."""
+        data = [self.content[a:b].tobytes() for a, b in zip(self.start[:-1], self.start[1:], strict=True)]
+        return list(zip(self.paths, data, strict=True))
 
 
 @dataclass(frozen=True)
@@ -354,7 +368,7 @@ class Training:
 
 _IMAGES = (Capture, Gaussians, Reconstruction)
 _KINDS = (Rig, Motion, Canonical, Clusters, Skinning, Surface, Curve, Skeleton, Poses, Parts, Database, Training)
-VALUES = {kind.__name__: kind for kind in (*_KINDS, *_IMAGES, Animation, Metrics, About, Picture, Cloth, File)}
+VALUES = {kind.__name__: kind for kind in (*_KINDS, *_IMAGES, Animation, Metrics, About, Picture, Cloth, Files)}
 
 
 def same(a: object, b: object) -> bool:

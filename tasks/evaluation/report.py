@@ -24,7 +24,7 @@ from tasks.errors import InputError
 from tasks.evaluation import page, typeset
 from tasks.evaluation.rows import to_csv
 from tasks.evaluation.tables import Table
-from tasks.values import File, Picture
+from tasks.values import Files, Picture
 
 PROVENANCE = "provenance.json"
 _STAGING = ".new-"
@@ -36,7 +36,7 @@ def write_report(
     tables: Sequence[Table],
     figures: Sequence[tuple[str, Picture]],
     provenance: Mapping[str, Any],
-    brought: Sequence[File] = (),
+    brought: Sequence[Files] = (),
 ) -> None:
     """Writes a report, over an earlier one if there is any; files that only the earlier one had are removed.
 
@@ -46,7 +46,7 @@ def write_report(
     """
     drawn = named(figures)
     files = contents(folder.name, rows, tables, drawn, provenance)
-    files |= {file.path: file.content.tobytes() for file in brought}
+    files |= {name: data for some in brought for name, data in some.items()}
     sums = {name: hashlib.sha256(data).hexdigest() for name, data in files.items()}
     captions = {name: picture.caption for name, picture in drawn.items()}
     text = json.dumps({**provenance, "figures": captions, "files": sums}, indent=2, allow_nan=False) + "\n"

@@ -12,41 +12,39 @@ import numpy as np
 from tasks.datasets import garments
 from tasks.evaluation.metrics import declared
 from tasks.garments.check import quality
-from tasks.values import About, File, Metrics, Poses
+from tasks.values import About, Files, Metrics, Poses
 from tasks.workspace import Workspace
 
 # what is asked of the dataset: share of vertices more than 2 mm inside the body, strain, metres a second
 DEEP, STRAIN, FASTEST = 0.005, 0.15, 25.0
 
 
-def check_garment(body: File, garment: File, *, every: int, workspace: Workspace) -> tuple[Metrics, File, About]:
+def check_garment(body: Files, garment: Files, *, every: int, workspace: Workspace) -> tuple[Metrics, Files, About]:
     """Reads the packed files again and measures them: numbers for the report, the garment's part of the manifest, and
     which of the goals are missed, in words.
 
     every: depth inside the body is measured at each `every`-th frame of a clip, strain and speed at all.
     """
-    for file in (body, garment):
-        (workspace.folder / Path(file.path).name).write_bytes(file.content.tobytes())
-    name = Path(garment.path).stem
+    for path, data in (*body.items(), *garment.items()):
+        (workspace.folder / Path(path).name).write_bytes(data)
+    name = Path(garment.paths[0]).stem
     facts = garment_facts(workspace.folder, name, every=every, say=workspace.say)
     numbers = _numbers(facts, "") | {"frames_count": facts["frames"], "points_count": facts["vertices"]}
     for clip, own in facts["clips"].items():
         numbers |= _numbers(own, f"@{clip}") | {f"frames_count@{clip}": own["frames"]}
-    text = json.dumps(facts, indent=1).encode()
-    facts_file = File(f"{name}.json", np.frombuffer(text, np.uint8))
-    return declared(numbers, "m"), facts_file, About(name, tuple(_missed(facts)))
+    part = Files.of({f"{name}.json": json.dumps(facts, indent=1).encode()})
+    return declared(numbers, "m"), part, About(name, tuple(_missed(facts)))
 
 
-def manifest(files: dict[str, File], facts: dict[str, File], *, every: int) -> File:
+def manifest(files: dict[str, Files], facts: dict[str, Files], *, every: int) -> Files:
     """``manifest.json``: size and sha256 of the files, and what :func:`check_garment` found."""
     stated = {
         "depth_measured_at_every": every,
-        "files": {Path(files[n].path).name: facts_of(files[n].content.tobytes()) for n in sorted(files)},
-        "garments": {name: json.loads(facts[name].content.tobytes()) for name in sorted(facts)},
+        "files": {Path(path).name: facts_of(data) for n in sorted(files) for path, data in files[n].items()},
+        "garments": {name: json.loads(facts[name].items()[0][1]) for name in sorted(facts)},
     }
-    folder = Path(next(iter(files.values())).path).parent
-    text = json.dumps(stated, indent=1) + "\n"
-    return File(str(folder / "manifest.json"), np.frombuffer(text.encode(), np.uint8))
+    folder = next(iter(files.values())).paths[0].rpartition("/")[0]
+    return Files.of({f"{folder}/manifest.json": (json.dumps(stated, indent=1) + "\n").encode()})
 
 
 def facts_of(data: bytes) -> dict:

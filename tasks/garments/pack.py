@@ -9,13 +9,13 @@ import numpy as np
 from tasks.geometry.kinematics import forward, joint_positions
 from tasks.geometry.quantise import encode
 from tasks.geometry.rotations import to_rotation_vector
-from tasks.values import Canonical, File, Motion, Poses
+from tasks.values import Canonical, Files, Motion, Poses
 
 FOLDER = "garments"  # in a report
 INFLUENCES = 5  # that Anny's vertices have at most
 
 
-def pack_body(body: Motion, cutting: Poses) -> File:
+def pack_body(body: Motion, cutting: Poses) -> Files:
     """``body.npz``; cutting: the pose in which garments are cut."""
     return _npz("body", body_arrays(body, cutting))
 
@@ -28,7 +28,7 @@ def pack_garment(
     *,
     step: float,
     clips: list[str],
-) -> File:
+) -> Files:
     """``<garment>.npz`` of the named clips, in that order. poses: of the body, whose last clip is the cloth's frames;
     step: see :func:`garment_arrays`."""
     shown = []
@@ -40,10 +40,10 @@ def pack_garment(
     return _npz(garment.source.split()[0], garment_arrays(body, garment, shown, step=step, fps=fps))
 
 
-def _npz(name: str, arrays: dict[str, np.ndarray]) -> File:
+def _npz(name: str, arrays: dict[str, np.ndarray]) -> Files:
     stream = io.BytesIO()
     np.savez_compressed(stream, **arrays)
-    return File(f"{FOLDER}/{name}.npz", np.frombuffer(stream.getvalue(), np.uint8))
+    return Files.of({f"{FOLDER}/{name}.npz": stream.getvalue()})
 
 
 def body_arrays(body: Motion, cutting: Poses) -> dict[str, np.ndarray]:

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from tasks.errors import InputError
 from tasks.geometry import rotations
+from tasks.geometry.gaussians import at_frame
 from tasks.values import Animation, Capture, Gaussians, Reconstruction
 
 NEIGHBOURS = 8  # whose motion says how a Gaussian turns
@@ -33,20 +34,6 @@ def render_views(
         posed = at_frame(reconstruction, int(f))
         images[i] = _image(posed, capture.view[i], capture.intrinsics[i], capture.size, backend)
     return replace(capture, images=images, has_alpha=True)
-
-
-def at_frame(reconstruction: Reconstruction, frame: int) -> Gaussians:
-    """The Gaussians of one frame. Colours stay in the world's frame: coefficients of degree 1 and up do not turn."""
-    rest, f = reconstruction.gaussians, frame
-    scales, opacities, quaternions = rest.scales, rest.opacities, rest.quaternions
-    if reconstruction.scaling is not None:
-        scales = scales * reconstruction.scaling[f][:, None]
-    if reconstruction.opacity is not None:
-        opacities = opacities * reconstruction.opacity[f]
-    if reconstruction.rotations is not None and quaternions is not None:
-        turned = rotations.from_quaternion(reconstruction.rotations[f]) @ rotations.from_quaternion(quaternions)
-        quaternions = rotations.to_quaternion(turned).astype(np.float32)
-    return replace(rest, means=reconstruction.points[f], scales=scales, opacities=opacities, quaternions=quaternions)
 
 
 def pose_gaussians(reconstruction: Reconstruction, animation: Animation) -> Reconstruction:

@@ -12,7 +12,8 @@ from torch import nn
 
 from tasks.errors import InputError
 from tasks.evaluation import images, lpips
-from tasks.reconstruction.views import at_frame, pose_gaussians, render_views
+from tasks.geometry.gaussians import at_frame
+from tasks.reconstruction.views import pose_gaussians, render_views
 from tasks.values import Animation, Capture, Gaussians, Reconstruction
 
 PICTURE = np.random.default_rng(0).random((40, 50, 3))

@@ -50,6 +50,10 @@ def write_glb(character: Character) -> bytes:
         node: dict = {"name": name, "translation": offsets[j].astype(float).tolist()}
         children = (1 + np.flatnonzero(up == j)).tolist()
         nodes.append(node | ({"children": children} if children else {}))
+    roots = (1 + np.flatnonzero(up < 0)).tolist()
+    if len(roots) > 1:  # joints of a skin must have a node above them all
+        nodes.append({"name": "bones", "children": roots})
+        roots = [len(nodes) - 1]
     bind = np.tile(np.eye(4, dtype=np.float32), (joints, 1, 1))
     bind[:, :3, 3] = -character.joints
     skin = {"joints": list(range(1, joints + 1)), "name": character.name}
@@ -57,7 +61,7 @@ def write_glb(character: Character) -> bytes:
     tree = {
         "asset": {"version": "2.0", "generator": "skelebones"},
         "scene": 0,
-        "scenes": [{"nodes": [0, *(1 + np.flatnonzero(up < 0)).tolist()]}],
+        "scenes": [{"nodes": [0, *roots]}],
         "nodes": nodes,
         "meshes": [{"name": character.name, "primitives": [_primitive(packer, character)]}],
         "skins": [skin],

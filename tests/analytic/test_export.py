@@ -115,6 +115,8 @@ def test_others_read_the_mesh(case):
     assert kind == b"JSON"
     tree = json.loads(data[20 : 20 + struct.unpack("<I", data[12:16])[0]])
     assert [a["name"] for a in tree["animations"]] == ["walk", "a_b"]
+    above = {child: n for n, node in enumerate(tree["nodes"]) for child in node.get("children", [])}
+    assert len({above[j] for j in tree["skins"][0]["joints"]}) == 1  # a skin's joints have a common root
     assert all(v["byteOffset"] % 4 == 0 for v in tree["bufferViews"])
 
 

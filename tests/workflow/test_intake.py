@@ -9,7 +9,7 @@ from flows.graph import Graph, Node
 from flows.pipeline import Planned, plan
 from tasks.errors import InputError
 
-TABLE4 = ["+experiment=table4", "sweep.datasets=[creature_figure]"]
+TABLE4 = ["+experiment=table4", "sweep.datasets=[scene_figure]"]
 
 
 def planned(overrides: list[str]) -> dict[str, Planned]:

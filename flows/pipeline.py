@@ -72,16 +72,15 @@ def _benchmark(case: Case, name: str, add) -> Planned:
         measured = add("benchmark", function, config["benchmark"] | own, "metrics", **inputs)
         return Planned(case, name, (measured,), nodes)
     nodes = intake.data(config, add)
-    if config["pipeline"] != "benchmark_skeleton":
-        stages = {"clustering": schema.CLUSTER, "decomposition": schema.SSDR}
-        own = {n: schema.arguments(f, config["bones"], config["seed"]) for n, f in stages.items()}
-        inputs = {n: nodes[n] for n in signature(function)[0]}
-    else:
+    inputs = {n: nodes[n] for n in signature(function)[0] if n != "surface"}
+    own = {}
+    if config["pipeline"] == "benchmark_skeleton":
         own = {"tracing": schema.arguments(schema.CURVE, config["skeleton"]["curve"], config["seed"])}
         surface = config["skeleton"]["surface"]
-        inputs = {
-            "surface": add("surface", schema.SURFACE, surface, "surface", canonical=nodes["canonical"])["surface"]
-        }
+        inputs["surface"] = add("surface", schema.SURFACE, surface, "surface", canonical=nodes["canonical"])["surface"]
+    elif "clustering" in signature(function)[1]:
+        stages = {"clustering": schema.CLUSTER, "decomposition": schema.SSDR}
+        own = {n: schema.arguments(f, config["bones"], config["seed"]) for n, f in stages.items()}
     outputs = "metrics picture" if config["pipeline"] == "scale_bones" else "metrics"
     measured = add("benchmark", function, config["benchmark"] | own, outputs, **inputs)
     drawn = {"picture": measured["picture"]} if "picture" in measured.outputs else {}

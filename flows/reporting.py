@@ -45,6 +45,13 @@ BENCHMARKS = {
         ("fps", "p99_ms", "clip_fps", "query_ms", "recall_at_7", "build_seconds", "memory"),
         {},
     ),
+    "benchmark_rasterizer": (
+        ("time_ratio", "forward_ratio"),
+        {
+            "Drawing with gradients, case by case": ("step_ms", "peer_step_ms", "time_ratio"),
+            "Drawing alone, case by case": ("forward_ms", "peer_forward_ms", "forward_ratio"),
+        },
+    ),
     "benchmark_skeleton": (
         ("time_ratio", "cpu_ratio", "seconds", "peer_seconds", "memory", "peer_memory"),
         {
@@ -256,10 +263,7 @@ def _garment_tables(rows, settings: dict, remarks: list[str], common: dict) -> l
 
     common |= {"data_status": {}, "stands_for": {}, "baselines": []}
     notes = [*remarks, *([settings["note"]] if settings["note"] else [])]
-    clips = rows[rows["metric"].str.contains("@")]
-    split = clips["metric"].str.split("@", n=1)
-    clips = clips.assign(method=split.str[1], metric=split.str[0])
-    shown = [(settings["title"], rows, (*CLOTH, "points_count"), notes), ("Clip by clip", clips, CLOTH, [])]
+    shown = [(settings["title"], rows, (*CLOTH, "points_count"), notes), ("Clip by clip", _by_case(rows), CLOTH, [])]
     return [unranked(build(r, title=title, metrics=m, notes=n, **common)) for title, r, m, n in shown]
 
 
@@ -321,7 +325,17 @@ def _benchmark_tables(cases: list[Case], rows, settings: dict, common: dict) -> 
     def table(title: str, metrics: tuple[str, ...], notes: list[str]):
         return unranked(build(turned, title=title, metrics=metrics, notes=notes, **common))
 
-    return [table(settings["title"], first, notes), *(table(t, metrics, []) for t, metrics in others.items())]
+    tables = [table(settings["title"], first, notes)]
+    if config["pipeline"] == "benchmark_rasterizer":  # its rows are cases, and the first table shows the worst of them
+        turned = _by_case(rows)
+    return [*tables, *(table(t, metrics, []) for t, metrics in others.items())]
+
+
+def _by_case(rows):
+    """The rows "metric@case" with the case as the row's name."""
+    named = rows[rows["metric"].str.contains("@")]
+    split = named["metric"].str.split("@", n=1)
+    return named.assign(method=split.str[1], metric=split.str[0])
 
 
 def _curve(cases: list[Case], rows, curve: list[str] | None) -> list:

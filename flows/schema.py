@@ -51,6 +51,7 @@ EVALUATE_LEFT_OUT = "tasks.evaluation.left_out:evaluate_left_out"
 SPREAD = "tasks.evaluation.left_out:spread"
 BENCHMARKS = {
     "benchmark_bones": "tasks.benchmarks.bones:benchmark_bones",
+    "benchmark_rasterizer": "tasks.benchmarks.rasterizer:benchmark_rasterizer",
     "benchmark_skeleton": "tasks.benchmarks.skeleton:benchmark_skeleton",
     "scale_bones": "tasks.benchmarks.scale:scale_bones",
     "benchmark_matching": "tasks.benchmarks.matching:benchmark_matching",

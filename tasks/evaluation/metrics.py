@@ -82,6 +82,11 @@ METRICS: dict[str, Metric] = {
     "held_out_rmse_ratio": Metric(
         "held-out RMSE ratio", "ratio", "lower", "on unseen frames, weights frozen, ours / its", 3
     ),
+    "forward_ratio": Metric("drawing ratio", "ratio", "lower", "milliseconds to draw, ours / the peer's", 4),
+    "step_ms": Metric("step", "milliseconds", "lower", "milliseconds to draw and to take all gradients, median"),
+    "peer_step_ms": Metric("peer's step", "milliseconds", "none", "the same of the peer"),
+    "forward_ms": Metric("drawing", "milliseconds", "lower", "milliseconds to draw alone, median"),
+    "peer_forward_ms": Metric("peer's drawing", "milliseconds", "none", "the same of the peer"),
     "seconds": Metric("time", "seconds", "lower", "seconds on the wall, median"),
     "peer_seconds": Metric("peer's time", "seconds", "none", "the same of the peer"),
     "cpu_seconds": Metric("processor time", "seconds", "lower", "processor time of all threads, median"),

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tasks.benchmarks import cgal, cost, dem_bones
+from tasks.benchmarks import cgal, cost, dem_bones, rasterizer
 from tasks.benchmarks.bones import benchmark_bones
 from tasks.benchmarks.scale import scale_bones, subdivided
 from tasks.benchmarks.skeleton import benchmark_skeleton, counts, limbs
@@ -214,3 +214,68 @@ def test_scale_settings_out_of_range_are_named(wrong):
     settings = {"subdivisions": 1, "shares": [0.5, 1.0], "repeats": 1, "threads": 1} | wrong
     with pytest.raises(InputError, match=next(iter(wrong))):
         scale_bones(*bending_rod(frames=3), **OURS, **settings)
+
+
+def a_ball() -> Canonical:
+    import igl
+
+    vertices, faces = igl.icosahedron()[:2]
+    return Canonical(vertices.astype(np.float32), faces.astype(np.int32), 0, "rest")
+
+
+RASTER = {"gaussians": [200], "sizes": [40], "threads": [1, 2], "repeats": 3, "seed": 0}
+
+
+def test_a_rasterizer_that_is_ours_has_ratios_near_one(monkeypatch):
+    """The twin draws the same Gaussians with our own kernel; case by case, all six numbers."""
+    import torch
+
+    from tasks.reconstruction.rasterize import rasterize
+
+    class Twin:
+        def __init__(self, *, size, **scene):
+            self.given, self.size = {name: torch.from_numpy(a) for name, a in scene.items()}, size
+
+        def forward(self):
+            self.images = rasterize(**self.given, size=self.size, background=torch.zeros(3))
+
+        def backward(self, of_rgb, of_alpha):
+            assert of_rgb.shape == (40, 40, 3)
+            assert of_alpha.shape == (40, 40)
+            assert 0.1 < float(self.images[1].mean()) < 0.7  # the ball fills part of the image
+
+    monkeypatch.setattr(rasterizer, "_library", lambda: Twin)
+    found = named(rasterizer.benchmark_rasterizer(a_ball(), **RASTER))
+    assert len(found) == 2 + 2 * 6
+    case = "200 at 40 px, 1 thread"
+    assert found[f"time_ratio@{case}"] == found[f"step_ms@{case}"] / found[f"peer_step_ms@{case}"]
+    assert found["forward_ratio"] == found[f"forward_ratio@{case}"]
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"), [({"gaussians": [1]}, "benchmark.gaussians"), ({"repeats": 0}, "repeats")]
+)
+def test_rasterizer_settings_out_of_range(changed, said):
+    with pytest.raises(InputError, match=said):
+        rasterizer.benchmark_rasterizer(a_ball(), **(RASTER | changed))
+
+
+@pytest.mark.slow
+def test_the_peer_in_warp_draws_what_ours_draws():
+    """Or its time would mean nothing: images and gradients agree to float32."""
+    pytest.importorskip("warp", reason="needs the extra bench (warp-lang)")
+    import torch
+
+    from tasks.reconstruction.rasterize import rasterize
+
+    scene = rasterizer.covering(a_ball(), 300, 40, 0)
+    slopes = np.random.default_rng(0).normal(size=(40, 40, 4)).astype(np.float32)
+    peer = rasterizer._library()(**scene, size=(40, 40))
+    theirs = [*peer.forward(), *peer.backward(slopes[..., :3], slopes[..., 3])]
+    given = {name: torch.from_numpy(a).requires_grad_(name in scene) for name, a in scene.items()}
+    images = rasterize(**given, size=(40, 40), background=torch.zeros(3))
+    of_images = [torch.from_numpy(slopes[..., :3].copy()), torch.from_numpy(slopes[..., 3])]
+    leaves = [given[name] for name in ("means", "scales", "sh", "opacities")]
+    ours = [*images, *torch.autograd.grad(images[:2], leaves, of_images)]
+    for a, b in zip(theirs, (t.detach().numpy() for t in ours), strict=True):
+        assert np.abs(a.reshape(b.shape) - b).max() < 2e-5 * np.abs(b).max()

@@ -19,6 +19,7 @@ _SUPPORT = 0.02  # bones that weigh more than this on a point that the dropped b
 _TRACE = 1e-3  # weights below do not count
 _SLOWEST, _FASTEST, _FASTER = 0.4, 0.95, 0.05  # Nesterov's extrapolation: start, most, growth a round
 _SMALLEST = 0.004  # of the diagonal: extent below which a bone's angle would be noise
+_EXACT = 1e-4  # of the diagonal: errors below are as good as none
 
 
 @dataclass(frozen=True)
@@ -82,21 +83,33 @@ def rigid_pieces(bones: Bones, labels: np.ndarray, least: int) -> Bones:
     return bones.refit(transforms, member)
 
 
-def prune(bones: Bones, size: float, *, angle: float, at_most: int) -> Bones:
-    """Drops the bone whose absence the others make up for best, again and again, each time with a round of SSDR, until
-    no more than ``at_most`` are left and each of them carries its points more than ``angle`` degrees away from where
-    the others could (:func:`absence`). size: the shape's diagonal."""
-    missed = absence(bones, np.arange(bones.count), size)
-    while bones.count > 1:
+def prune(bones: Bones, size: float, *, knee: float, angle: float, at_most: int) -> Bones:
+    """Drops the bone whose absence the others make up for best (:func:`absence`), again and again, each time with a
+    round of SSDR, down to the knee of error against count: as long as spare bones go, the error stays about where it
+    was, and it leaps with the first that carries a limb.
+
+    Stops before the error exceeds ``knee`` times the least so far (or times ``_EXACT``, where that is more), or when
+    every bone carries its points more than ``angle`` degrees away from where the others could; but not above
+    ``at_most`` bones. size: the shape's diagonal.
+    """
+    missed, least, kept = absence(bones, np.arange(bones.count), size), np.inf, bones
+    while True:
+        error = bones.error()
+        least = min(least, error)
+        if bones.count <= at_most:
+            if kept.count <= at_most and error > knee * max(least, _EXACT * size):
+                return kept
+            kept = bones
+            if missed[:, 0].min() >= np.radians(angle):
+                return kept
+        if bones.count == 1:
+            return bones
         drop = int(np.argmin(missed[:, 1]))
-        if missed[drop, 0] >= np.radians(angle) and bones.count <= at_most:
-            break
         held = bones.weights[:, drop] > _SUPPORT
         near = ((bones.weights > _SUPPORT) & held[:, None]).any(axis=0)
         others = np.delete(np.arange(bones.count), drop)
         bones, missed, near = bones.keep(others).improve(1), missed[others], np.flatnonzero(near[others])
         missed[near] = absence(bones, near, size)
-    return bones
 
 
 def absence(bones: Bones, which: np.ndarray, size: float) -> np.ndarray:

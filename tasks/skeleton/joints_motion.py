@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import igl
@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from tasks.errors import InputError
 from tasks.geometry.measure import diagonal
 from tasks.geometry.neighbours import adjacency, mesh_edges
+from tasks.geometry.rotations import geodesic, project_so3
 from tasks.skeleton.articulation import centres
 from tasks.skeleton.curve_weights import Interpolation, node_lengths, node_weights, onto_surface, thin, vertex_areas
 from tasks.skeleton.inner_bones import Bones, merge_alike, prune, relative_turn, rigid_pieces
@@ -31,6 +32,8 @@ _HOLD = {
 _FRAMES, _POINTS = 100, 2500  # looked at while bones are pruned; the refit sees more
 _REFIT_FRAMES, _REFIT_POINTS = 300, 6000
 _INFLUENCES = 4  # bones a point follows while they are pruned: more let ghosts hide
+_AFTER = 6  # and once they are chosen
+_LIMBS, _TRUNK = 3, 0.3  # the root has at least so many bones round it, and this part of the largest such bone's skin
 _LEAST = 3  # points that a piece needs to turn as a whole
 _WARM_UP = 3  # rounds of SSDR before pruning
 
@@ -79,6 +82,7 @@ def joints_by_motion(
     max_joints: int,
     topology: Literal["auto", "motion", "curve"],
     rigid_residual: float,
+    knee: float,
     missed: float,
     angle: float,
     shortest: float,
@@ -93,19 +97,20 @@ def joints_by_motion(
 
     max_joints: most joints; topology: ``motion`` takes the spanning tree of least joint gap, which is right for
     articulated bodies; ``curve`` keeps the curve's own tree, which does not tangle under cloth and soft tissue;
-    ``auto`` takes the first where its median gap is under ``rigid_residual``; missed: degrees by which a bone's points
-    must miss without it, or it goes; angle: degrees below which two bones that touch are one; shortest: run of curve
-    below which a bone is dropped (curve topology); reach: how far a joint may lie from where its bones meet on the
-    curve; rounds: rounds of SSDR once the bones are chosen; refits: rounds of refitting; influences: most joints a
-    point may follow. Lengths are shares of the bounding-box diagonal. Raises InputError for settings out of range.
+    ``auto`` takes the first where its median gap is under ``rigid_residual``; knee: times the least error that fewer
+    bones may cost; missed: degrees by which a bone's points must miss without it to be safe; angle: degrees below
+    which two bones that touch are one; shortest: run of curve below which a bone is dropped (curve topology); reach:
+    how far a joint may lie from where its bones meet on the curve; rounds: rounds of SSDR once the bones are chosen;
+    refits: rounds of refitting; influences: most joints a point may follow. Lengths are shares of the bounding-box
+    diagonal. Raises InputError for settings out of range.
     """
-    _check_settings(max_joints, influences, angle, missed)
+    _check_settings(max_joints, influences, knee, angle, missed)
     size = diagonal(canonical.points)
     chosen = thin(canonical, surface, curve, _POINTS)
     body = Body(surface, curve, onto_surface(_sampled(canonical, chosen), surface), size)
     frames = _spread(train.frames, _FRAMES)
     bones = _bones(train, canonical, skinning, frames, chosen)
-    bones = few_bones(bones, body, at_most=max_joints, missed=missed, angle=angle, rounds=rounds)
+    bones = few_bones(bones, body, at_most=max_joints, knee=knee, missed=missed, angle=angle, rounds=rounds)
     found = by_motion(bones, body, reach)
     soft = topology == "curve" or (topology == "auto" and np.median(_tree_residuals(found)) > rigid_residual)
     if soft:
@@ -127,14 +132,18 @@ def joints_by_motion(
     return Skeleton(joint_names(len(joints)), parents, joints.astype(np.float32), weights)
 
 
-def few_bones(bones: Bones, body: Body, *, at_most: int, missed: float, angle: float, rounds: int) -> Bones:
+def few_bones(
+    bones: Bones, body: Body, *, at_most: int, knee: float, missed: float, angle: float, rounds: int
+) -> Bones:
     """From the free bones to those that a skeleton needs."""
     label = _pieces(bones, body)
     bones = rigid_pieces(bones, label, _LEAST).improve(_WARM_UP)
-    bones = body.dominant(prune(bones, body.size, angle=missed, at_most=at_most).improve(rounds)).improve(rounds)
+    bones = prune(bones, body.size, knee=knee, angle=missed, at_most=at_most).improve(rounds)
+    bones = body.dominant(bones).improve(rounds)
     on_curve = body.on_curve(bones.weights)
     shared = on_curve.T @ (on_curve * node_lengths(body.curve)[:, None])
-    return merge_alike(bones, np.where(shared > 1e-3 * node_lengths(body.curve).mean(), shared, 0.0), angle)
+    bones = merge_alike(bones, np.where(shared > 1e-3 * node_lengths(body.curve).mean(), shared, 0.0), angle)
+    return replace(bones, influences=_AFTER).improve(2 * rounds)
 
 
 def by_motion(bones: Bones, body: Body, reach: float) -> Articulation:
@@ -268,18 +277,33 @@ def _tree_residuals(found: Articulation) -> np.ndarray:
 
 
 def _assemble(found: Articulation, body: Body) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Order of the bones (J,), parents (J,) and joints (J, 3). The root is the bone that carries most of the surface:
-    the pelvis or the chest, while the one nearest the centroid is often the neck. Its joint lies on the curve, in the
-    bone's middle."""
-    root = int(np.argmax(found.areas))
+    """Order of the bones (J,), parents (J,) and joints (J, 3). The root's joint lies on the curve where the median of
+    its children's joints is: a pelvis between its thighs."""
+    root = _root(found)
     order, parents = kinematic_tree(found.links, found.costs, root, len(found.middles))
     at = _link_of(found.links)
     joints = np.empty((len(order), 3))
-    nodes = body.curve.nodes.astype(np.float64)
-    joints[0] = nodes[np.linalg.norm(nodes - found.middles[root], axis=1).argmin()]
     for j in range(1, len(order)):
         joints[j] = found.points[at[_pair(order[j], order[parents[j]])]]
+    children = joints[parents == 0]
+    place = np.median(children, axis=0) if len(children) else found.middles[root]
+    nodes = body.curve.nodes.astype(np.float64)
+    joints[0] = nodes[np.linalg.norm(nodes - place, axis=1).argmin()]
     return order, parents, joints
+
+
+def _root(found: Articulation) -> int:
+    """The bone that turns least in the world, of those in the trunk: several limbs hang on them and they carry much
+    skin. That is the pelvis rather than the chest, and never the head."""
+    count = len(found.middles)
+    order, parents = kinematic_tree(found.links, found.costs, 0, count)
+    ends = np.concatenate([order[1:], order[parents[1:]]])
+    hub = np.bincount(ends, minlength=count) >= _LIMBS
+    areas = np.where(hub, found.areas, 0.0) if hub.any() else found.areas
+    trunk = np.flatnonzero(areas >= _TRUNK * areas.max())
+    rotations = found.bones.transforms[:, trunk, :, :3]
+    turn = geodesic(rotations, project_so3(rotations.mean(axis=0))).mean(axis=0)
+    return int(trunk[np.argmin(turn)])
 
 
 def _pair(a: int, b: int) -> tuple[int, int]:
@@ -295,10 +319,11 @@ def _middles(share: np.ndarray, curve: Curve) -> np.ndarray:
     return (share.T @ curve.nodes) / share.sum(axis=0)[:, None]
 
 
-def _check_settings(max_joints: int, influences: int, angle: float, missed: float) -> None:
+def _check_settings(max_joints: int, influences: int, knee: float, angle: float, missed: float) -> None:
     for name, value, low, high in (
         ("max_joints", max_joints, 1, 500),
         ("influences", influences, 1, 16),
+        ("knee", knee, 1.0, 100.0),
         ("angle", angle, 0.0, 90.0),
         ("missed", missed, 0.0, 90.0),
     ):

@@ -194,6 +194,6 @@ def test_pruning_keeps_small_bones_that_turn_and_drops_large_ones_that_do_not():
     turns[:, 3] = rng.uniform(-0.5, 0.5, (40, 3))  # the last 5 % of the length; joint 2 in the middle never turns
     shape = Bending(4.0, [0.0, 1.0, 2.0, 3.8], turns, np.zeros((40, 3)), 0.05)
     bones = Bones(shape.canonical.points.astype(float), shape.motion.points, shape.weights, shape.transforms, 4)
-    kept = prune(bones, 4.0, angle=4.0, at_most=10)
+    kept = prune(bones, 4.0, knee=1.7, angle=6.0, at_most=10)
     assert kept.count == 3
     assert kept.error() < 1e-3

@@ -13,6 +13,7 @@ from tasks.errors import InputError
 
 GROUPS = config.groups()
 FILE = ["dataset=mesh_sequence", "dataset.path=some.npz"]
+OF_A_FIT = ("scene", "views")  # groups that only a fit has
 NEEDS_PATH = ("mesh_sequence", "rigged_character", "vto", "anime", "dnerf", "multiview")
 
 
@@ -28,6 +29,7 @@ def test_every_experiment_composes(name):
 def test_every_choice_composes(group):
     for choice in GROUPS[group]:
         extra = ["dataset.path=some.npz"] if choice in NEEDS_PATH else []
+        extra += ["reconstruction=cpu"] if group in OF_A_FIT else []
         sweep = ["sweep.datasets=null", "sweep.methods=null"]
         assert config.expand([f"{group}={choice}", *extra, *sweep])
 

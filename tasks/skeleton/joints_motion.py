@@ -12,12 +12,13 @@ from scipy.spatial import cKDTree
 
 from tasks.errors import InputError
 from tasks.geometry.measure import diagonal
+from tasks.geometry.moments import skin_error, skin_moments
 from tasks.geometry.neighbours import adjacency, mesh_edges
 from tasks.geometry.rotations import geodesic, project_so3
 from tasks.skeleton.articulation import centres
 from tasks.skeleton.curve_weights import Interpolation, node_lengths, node_weights, onto_surface, thin, vertex_areas
 from tasks.skeleton.inner_bones import Bones, merge_alike, prune, relative_turn, rigid_pieces
-from tasks.skeleton.refit import refit, spread_weights
+from tasks.skeleton.refit import posed, refit, spread_weights
 from tasks.skeleton.runs import find_runs
 from tasks.skeleton.tree import joint_names, kinematic_tree, link_components
 from tasks.values import Canonical, Curve, Motion, Skeleton, Skinning, Surface
@@ -33,6 +34,7 @@ _FRAMES, _POINTS = 100, 2500  # looked at while bones are pruned; the refit sees
 _REFIT_FRAMES, _REFIT_POINTS = 300, 6000
 _INFLUENCES = 4  # bones a point follows while they are pruned: more let ghosts hide
 _AFTER = 6  # and once they are chosen
+_CLEARLY = 0.9  # of the squared error
 _LIMBS, _TRUNK = 3, 0.3  # the root has at least so many bones round it, and this part of the largest such bone's skin
 _LEAST = 3  # points that a piece needs to turn as a whole
 _WARM_UP = 3  # rounds of SSDR before pruning
@@ -111,7 +113,7 @@ def joints_by_motion(
     frames = _spread(train.frames, _FRAMES)
     bones = _bones(train, canonical, skinning, frames, chosen)
     bones = few_bones(bones, body, at_most=max_joints, knee=knee, missed=missed, angle=angle, rounds=rounds)
-    found = by_motion(bones, body, reach)
+    found = better_posed(by_motion(bones, body, reach), by_motion(bones, body, reach, relative=True), body)
     soft = topology == "curve" or (topology == "auto" and np.median(_tree_residuals(found)) > rigid_residual)
     if soft:
         found = by_curve(bones, body, reach, shortest=shortest, angle=angle, at_most=max_joints)
@@ -146,9 +148,9 @@ def few_bones(
     return replace(bones, influences=_AFTER).improve(2 * rounds)
 
 
-def by_motion(bones: Bones, body: Body, reach: float) -> Articulation:
+def by_motion(bones: Bones, body: Body, reach: float, *, relative: bool = False) -> Articulation:
     """Every pair of bones that shares some curve is a candidate; a gap, a joint far from the shared curve and a small
-    share all make it dear."""
+    share all make it dear. relative: the share counts against what both bones have of the curve."""
     curve, size = body.curve, body.size
     on_curve, length = body.on_curve(bones.weights), node_lengths(curve)
     edges = link_components(curve.nodes, curve.edges)
@@ -162,10 +164,24 @@ def by_motion(bones: Bones, body: Body, reach: float) -> Articulation:
     points, residuals = centres(bones.transforms, pairs, guess, np.full(len(pairs), _PULL), reach * size)
     away = np.linalg.norm(points - guess, axis=1)
     common = np.maximum(shared[pairs[:, 0], pairs[:, 1]], 1e-6 * length.mean())
+    if relative:
+        common = common / np.sqrt(shared[pairs[:, 0], pairs[:, 0]] * shared[pairs[:, 1], pairs[:, 1]])
     costs = (residuals / size + 0.3 * away / size + 0.001) / np.sqrt(common)
     middles = _middles(on_curve * length[:, None], curve)
     areas = vertex_areas(body.surface) @ body.carry.carry(bones.weights)
     return Articulation(bones, pairs, points, residuals / size, costs, middles, areas)
+
+
+def better_posed(first: Articulation, second: Articulation, body: Body) -> Articulation:
+    """The first, unless the tree of the second follows the motion clearly better when both are posed."""
+    return second if _posed_error(second, body) < _CLEARLY * _posed_error(first, body) else first
+
+
+def _posed_error(found: Articulation, body: Body) -> float:
+    order, parents, joints = _assemble(found, body)
+    bones, origin = found.bones, found.bones.rest.mean(axis=0)
+    moments = skin_moments(bones.rest - origin, bones.weights[:, order], bones.paths - origin.astype(np.float32))
+    return float(skin_error(moments, posed(parents, joints - origin, moments)).mean())
 
 
 def by_curve(bones: Bones, body: Body, reach: float, *, shortest: float, angle: float, at_most: int) -> Articulation:

@@ -64,11 +64,16 @@ def spread_weights(
     origin = rest.mean(axis=0, dtype=np.float64)
     points, rest, joints = points - origin.astype(np.float32), rest - origin, joints - origin
     moments = skin_moments(rest[chosen], weights, points[:, chosen])
-    world, root = warm_start(parents, joints, moments, _STIFFNESS)
-    world, root = solve_poses(parents, joints, moments, world, root, steps=_FIRST_STEPS, damping=_DAMPING)
-    transforms = transforms_of(parents, joints, world, root)
+    transforms = posed(parents, joints, moments)
     start = weights[cKDTree(rest[chosen]).query(rest)[1]]
     return _fit(rest, points, transforms, start, weights.sum(axis=0) > 0, influences)
+
+
+def posed(parents: np.ndarray, joints: np.ndarray, moments: Moments) -> np.ndarray:
+    """Transforms (F, J, 3, 4) of the joints' best poses."""
+    world, root = warm_start(parents, joints, moments, _STIFFNESS)
+    world, root = solve_poses(parents, joints, moments, world, root, steps=_FIRST_STEPS, damping=_DAMPING)
+    return transforms_of(parents, joints, world, root)
 
 
 def _fit(rest, points, transforms, start, used, influences) -> np.ndarray:

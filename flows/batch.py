@@ -24,6 +24,17 @@ class Experiment:
     cases: list[Case]
     missing: list[Missing] = field(default_factory=list)
 
+    @property
+    def not_run(self) -> list[tuple[str, str]]:
+        """What is missing, those with one reason together, and why."""
+        whys: dict[str, list[str]] = {}
+        for one in self.missing:
+            whys.setdefault(one.why, []).append(one.what)
+        return [
+            (f"{names[0]} and {len(names) - 1} more" if len(names) > 8 else ", ".join(names), why)
+            for why, names in whys.items()
+        ]
+
 
 @dataclass(frozen=True)
 class Batch:

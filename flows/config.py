@@ -107,10 +107,9 @@ def expand_some(
         raise InputError(name, expected="one value", found=sweeps[0].input_line, do="add -m to run all of them")
     axes = [[parse(f"{_plus(o)}{o.key_or_group}={v}") for v in o.sweep_string_iterator()] for o in sweeps]
     fixed = [o for o in parsed if not o.is_sweep_override()]
-    compose_once = cache(_compose)
     cases: list[Case] = []
     for point in itertools.product(*axes):
-        cases += _sweep([*fixed, *point], list(point), compose_once, used, missing)
+        cases += _sweep([*fixed, *point], list(point), used, missing)
     used |= {o.input_line for o, axis in zip(sweeps, axes, strict=True) if all(v.input_line in used for v in axis)}
     return list({(c.dataset, c.method, c.variant, str(c.config)): c for c in cases}.values())
 
@@ -132,7 +131,7 @@ def check_used(overrides: list[str], used: set[str], cases: list[Case]) -> None:
 
 
 def _sweep(
-    overrides: list[Override], point: list[Override], compose_once, used: set[str], missing: list[Missing] | None
+    overrides: list[Override], point: list[Override], used: set[str], missing: list[Missing] | None
 ) -> Iterator[Case]:
     """The cases of one point of a multirun: the experiment's datasets x methods x ablations.
 
@@ -141,7 +140,7 @@ def _sweep(
     choices = {o.key_or_group: str(o.value()) for o in overrides if o.key_or_group in groups()}
     values = [o for o in overrides if o.key_or_group not in choices]
     used |= {o.input_line for o in overrides if o.key_or_group in choices}
-    base, set_here = _set(compose_once(_group_overrides(choices)), values)
+    base, set_here = _set(_compose(_group_overrides(choices)), values)
     used |= {text for text in set_here if text.startswith("sweep.")}
     sweep = schema.check(_plain(base)["sweep"], SWEEP, "sweep.")
     unnamed = ("seed", "method_seed", "dataset", "dataset.path", "method")  # have columns of their own
@@ -150,7 +149,7 @@ def _sweep(
         chosen = {"dataset": dataset, "method": method} | choices  # what the user typed wins over the experiment
         if ablation and ablation != NO_ABLATION:
             chosen["ablation"] = f"[{','.join(ablation.split('+'))}]"
-        composed, set_here = _set(compose_once(_group_overrides(chosen)), values)
+        composed, set_here = _set(_compose(_group_overrides(chosen)), values)
         used |= set_here
         config = _plain(composed)
         variant = ",".join(filter(None, [ablation, label])) or NO_ABLATION
@@ -254,6 +253,7 @@ def _check_choices(group: str, choice: str, valid: list[str]) -> None:
             raise InputError(group, expected=f"one of {', '.join(valid)}", found=repr(one))
 
 
+@cache
 def _compose(overrides: tuple[str, ...]) -> DictConfig:
     known = groups()
     for text in overrides:  # the choices of an experiment's own grid are checked here, the user's were before

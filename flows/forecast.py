@@ -65,10 +65,9 @@ def expected(node: Node, past: list[Artefact]) -> Cost | None:
     if not chosen:
         return None
     return Cost(
-        median(a.seconds for a in chosen),
-        median(a.peak_mb for a in chosen),
-        median(a.size for a in chosen),
-        len(chosen),
+        seconds=median(a.seconds for a in chosen),
+        peak_mb=median(a.peak_mb for a in chosen),
+        size=median(a.size for a in chosen),
     )
 
 
@@ -93,8 +92,8 @@ def show(batch: Batch) -> None:
             console.print(f"to compute  {node.stage:<10} {short(node.cases)}{more}  {_said(f.cost)}", markup=False)
     console.print(_by_stage(forecasts))
     for experiment in batch.experiments:
-        for m in experiment.missing:
-            console.print(f"{experiment.name}: not run: {m.what}, {m.why}", markup=False)
+        for what, why in experiment.not_run:
+            console.print(f"{experiment.name}: not run: {what}, {why}", markup=False)
     console.print(_whole(forecasts, batch.config, len(works)), markup=False)
 
 

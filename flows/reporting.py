@@ -97,9 +97,9 @@ class Report:
     @property
     def line(self) -> str:
         """The report in a line, for the terminal."""
-        missing = f"not run: {'; '.join(f'{m.what}: {m.why}' for m in self.experiment.missing)}"
         said = [f"report in {self.folder}"] if self.folder else []
-        return f"{self.experiment.name}: {', '.join([*said, *([missing] if self.experiment.missing else [])])}"
+        said += [f"not run: {what}: {why}" for what, why in self.experiment.not_run]
+        return f"{self.experiment.name}: {'; '.join(said)}"
 
 
 def write(work: Work, refs: dict[str, Ref], computed: set[str], store: Store) -> Report:
@@ -112,7 +112,7 @@ def write(work: Work, refs: dict[str, Ref], computed: set[str], store: Store) ->
     rows = join([_rows(p, refs, store) for p in planned])
     about = [_about(p, refs, store) for p in planned]
     remarks = list(dict.fromkeys(f"{a.name}: {note}." for a in about for note in a.notes))
-    said = [f"Not run: {m.what}, {m.why}." for m in work.experiment.missing] + _fit_notes(planned, refs)
+    said = [f"Not run: {what}, {why}." for what, why in work.experiment.not_run] + _fit_notes(planned, refs)
     tables = tables_of(cases, rows, remarks, said)
     figures = [(node.cases[0], store.load(refs[node.id], "picture")) for node in work.pictures]
     figures += _curve(cases, rows, settings["curve"])
@@ -169,7 +169,7 @@ def write_index(batch: Batch, reports: list[Report]) -> Path:
             command=command(r.experiment.arguments),
             tables=r.tables,
             figures=[picture for _, picture in r.figures],
-            missing=[(m.what, m.why) for m in r.experiment.missing],
+            missing=r.experiment.not_run,
         )
         for r in every
     ]

@@ -63,8 +63,8 @@ def _flow(batch: Batch, graph: Graph, works: list[Work], show: bool):
 
         bar = ProgressArtifact(experiment, len(graph.nodes))
         with Progress(graph, show, bar.update) as progress:
-            for missing in (m for experiment in batch.experiments for m in experiment.missing):
-                progress.note(f"not run: {missing.what}, {missing.why}")
+            for what, why in (pair for experiment in batch.experiments for pair in experiment.not_run):
+                progress.note(f"not run: {what}, {why}")
             outcome, reports = _computed_reports(batch, graph, works, progress)
         for report in [r for r in reports if r.folder]:
             publish(report.folder, report.markdown)

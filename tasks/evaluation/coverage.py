@@ -61,7 +61,7 @@ def cover(paper: Paper, measured: Sequence[Measured], absent: Mapping[str, str])
                 paper=cell.value,
                 ours=value,
                 status=status,
-                why="" if best else why or "no experiment of this run measures it",
+                why="" if best else why or "not measured in this run",
             )
         )
     return tables

@@ -33,10 +33,12 @@ pre { background: var(--card); border-radius: 8px; padding: .55rem .8rem; margin
   font: .84rem/1.4 ui-monospace, Menlo, Consolas, monospace }
 .lead { color: var(--soft); margin: .2rem 0 1rem }
 .missing { border-left: 3px solid var(--subst); padding: .1rem .8rem; font-size: .9rem; overflow-wrap: anywhere }
-.coverage td, .coverage th { padding: .3rem .55rem }
+.coverage td, .coverage th { padding: .3rem .5rem }
 .coverage td { white-space: nowrap }
-.coverage td.why { white-space: normal; text-align: left; min-width: 9rem; font-size: .84rem; color: var(--soft) }
-.coverage tr.group th { text-align: left; padding-top: .8rem; font-weight: 600; position: static; box-shadow: none }
+.coverage td:last-child, .coverage thead th:last-child { text-align: left }
+.coverage tr.group th { text-align: left; padding-top: .8rem; font-weight: 600; position: static; box-shadow: none;
+  white-space: normal }
+.coverage tr.group small { display: block; color: var(--soft); font-weight: 400 }
 .badge.reproduced { color: var(--real) }
 .badge.not { color: var(--soft) }
 .gallery { display: grid; gap: 1rem; grid-template-columns: repeat(auto-fit, minmax(min(100%, 30rem), 1fr)) }
@@ -46,7 +48,8 @@ pre { background: var(--card); border-radius: 8px; padding: .55rem .8rem; margin
 .picture .pan img { width: 100%; max-width: none }
 .picture svg { max-width: 100%; height: auto }
 .wide { grid-column: 1 / -1 }
-@media (max-width: 40rem) { .wide .pan img { width: auto; min-width: 44rem } .pan { padding-bottom: .3rem } }
+@media (max-width: 40rem) { .broad .pan img { width: 36rem } .coverage { font-size: .84rem }
+  .coverage td, .coverage th { padding: .3rem .35rem } }
 """
 
 _PAGE = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(
@@ -71,13 +74,13 @@ not.</p>
 <summary>Table {{ number }}: {{ said }}</summary>
 <div class="scroll">
 <table class="coverage">
-<thead><tr><th>method</th><th>paper</th><th>ours</th><th>difference</th><th>status</th></tr></thead>
+<thead><tr><th>method</th><th>paper</th><th>ours</th><th>diff.</th><th>status</th></tr></thead>
 <tbody>
-{% for heading, cells in groups %}
-<tr class="group"><th colspan="5">{{ heading }}</th></tr>
+{% for heading, whys, cells in groups %}
+<tr class="group"><th colspan="5">{{ heading }}{% for why in whys %}<small>{{ why }}</small>{% endfor %}</th></tr>
 {% for c in cells %}
 <tr><th>{{ c.method }}</th><td class="paper">{{ c.paper }}</td><td>{{ c.ours }}</td><td>{{ c.difference }}</td>\
-<td class="why"><span class="badge {{ c.badge }}">{{ c.status }}</span> {{ c.why }}</td></tr>
+<td><span class="badge {{ c.badge }}">{{ c.status }}</span></td></tr>
 {% endfor %}
 {% endfor %}
 </tbody>
@@ -98,8 +101,8 @@ not.</p>
 {% endfor %}
 {% if s.figures %}
 <div class="gallery">
-{% for caption, picture, wide in s.figures %}
-<figure class="picture{% if wide %} wide{% endif %}"><figcaption>{{ caption }}</figcaption>\
+{% for caption, picture, kind in s.figures %}
+<figure class="picture {{ kind }}"><figcaption>{{ caption }}</figcaption>\
 <div class="pan">{{ picture }}</div></figure>
 {% endfor %}
 </div>
@@ -174,10 +177,11 @@ def _section(section: Section, seen: set[bytes]) -> dict[str, Any]:
     }
 
 
-def _shown(picture: Picture) -> tuple[Markup, bool]:
-    """The picture for the page, pixels as WebP, and whether it is much wider than high."""
+def _shown(picture: Picture) -> tuple[Markup, str]:
+    """The picture for the page, pixels as WebP, and its class: broad where a phone shows a part of it, wide where it
+    takes a whole row of the page."""
     if picture.suffix != "png":
-        return page.inline(picture), False
+        return page.inline(picture), ""
     pixels = cv2.imdecode(np.frombuffer(picture.data, np.uint8), cv2.IMREAD_COLOR)
     height, width = pixels.shape[:2]
     if width > WIDEST:
@@ -185,35 +189,42 @@ def _shown(picture: Picture) -> tuple[Markup, bool]:
     _, data = cv2.imencode(".webp", pixels, [cv2.IMWRITE_WEBP_QUALITY, QUALITY])
     tag = Markup('<img loading="lazy" src="data:image/webp;base64,{}" width="{}" height="{}" alt="{}">')
     text = base64.b64encode(data.tobytes()).decode()
-    return tag.format(text, pixels.shape[1], pixels.shape[0], picture.caption), width > 1.6 * height
+    shown = tag.format(text, pixels.shape[1], pixels.shape[0], picture.caption)
+    return shown, ("broad wide" if width > WIDEST else "broad") if width > 1.6 * height else ""
 
 
 def _table(number: int, cells: Sequence[Covered]) -> tuple[int, list, bool, str]:
-    """A table of the paper by columns: its number, (heading, cells as text), whether it is open, how much was run."""
+    """A table of the paper by columns: its number; heading, reasons and cells as text of each; whether it is open; how
+    much was run."""
     ordered = sorted(cells, key=lambda c: [(d.column, d.metric) for d in cells].index((c.column, c.metric)))
     groups = []
-    for (column, metric), members in groupby(ordered, key=lambda c: (c.column, c.metric)):
-        members = list(members)
-        digits = digits_for([v for c in members for v in (c.paper, c.ours) if v is not None], metric)
+    for (column, metric), group in groupby(ordered, key=lambda c: (c.column, c.metric)):
+        members = list(group)
+        digits = digits_for([c.ours for c in members if c.ours is not None], metric)
         label, unit = metric_of(metric).label, members[0].unit
         heading = f"{column}, {label}" + ("" if unit in ("ratio", "count", "unit") else f" [{unit}]")
-        groups.append((heading, [_cell(c, digits) for c in members]))
+        groups.append((heading, _reasons(members), [_cell(c, digits) for c in members]))
     return number, groups, any(c.ours is not None for c in cells), _counts(cells)
 
 
-def _cell(cell: Covered, digits: int) -> dict[str, str]:
-    def number(value: float | None, signed: bool = False) -> str:
-        return "–" if value is None else typeset.number(value, digits, signed=signed)
+def _reasons(cells: Sequence[Covered]) -> list[str]:
+    """Why cells of a column were not run, a line for every reason."""
+    whys: dict[str, list[str]] = {}
+    for cell in cells:
+        if cell.why:
+            whys.setdefault(cell.why, []).append(cell.method)
+    return [f"{', '.join(names) if len(names) < len(cells) else 'not run'}: {why}" for why, names in whys.items()]
 
+
+def _cell(cell: Covered, digits: int) -> dict[str, str]:
     gap = None if cell.paper is None or cell.ours is None else cell.ours - cell.paper
     return {
         "method": cell.method,
-        "paper": "?" if cell.paper is None else number(cell.paper),
-        "ours": number(cell.ours),
-        "difference": number(gap, signed=True),
+        "paper": "?" if cell.paper is None else f"{cell.paper:g}",
+        "ours": "–" if cell.ours is None else typeset.number(cell.ours, digits),
+        "difference": "–" if gap is None else typeset.number(gap, digits, signed=True),
         "status": cell.status,
         "badge": cell.status.split(" ", 1)[0],
-        "why": cell.why,
     }
 
 

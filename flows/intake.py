@@ -34,8 +34,8 @@ def reconstruct(config: dict, add) -> tuple[Nodes, list[Node]]:
         nodes = _images(config, add)
         truth = None
     else:
-        nodes = _meshes(config, add)
-        truth = nodes[{"all": "motion", "train": "train", "test": "test"}[config["scene"]["part"]]]
+        nodes = _mesh(config, add)
+        truth = _part(config, add, nodes)
         nodes |= _scene(config, add, truth)
     nodes |= _fit(config, add, nodes["capture"])
     nodes["about"] = add("about", schema.ABOUT, {}, "about", motion=nodes.get("motion", nodes["paths"]))["about"]
@@ -46,16 +46,33 @@ def reconstruct(config: dict, add) -> tuple[Nodes, list[Node]]:
     return nodes, metrics
 
 
+def scene(config: dict, add, name: str) -> tuple[Nodes, list[Node]]:
+    """Images rendered of moving meshes, as files, with what they hold."""
+    nodes = _mesh(config, add)
+    truth = _part(config, add, nodes)
+    nodes |= _scene(config, add, truth)
+    images = {n: nodes[n] for n in ("capture", "views")}
+    nodes["scene_files"] = add("files", schema.SCENE_FILES, {"name": name}, "files", **images)["files"]
+    nodes["picture"] = add("figures", schema.SCENE_PICTURE, {}, "picture", **images)["picture"]
+    return nodes, [add("evaluate", schema.EVALUATE_SCENE, {}, "metrics", **images, motion=truth)]
+
+
 def unseen_views(config: dict, add, nodes: Nodes) -> list[Node]:
     """The metrics of the posed Gaussians, rendered where cameras see the unseen frames; none without such cameras."""
     if "unseen_views" not in nodes:
         return []
     inputs = {n: nodes[n] for n in ("reconstruction", "animation", "skinning")} | {"motion": nodes["test"]}
     posed = add("pose", schema.POSE_GAUSSIANS, {}, "reconstruction", **inputs)["reconstruction"]
+    nodes["posed"] = posed
     return [_compare(config, add, nodes, posed, nodes["unseen_views"])]
 
 
 def _meshes(config: dict, add) -> Nodes:
+    nodes = _mesh(config, add)
+    return nodes | _split(config, add, nodes["motion"])
+
+
+def _mesh(config: dict, add) -> Nodes:
     kind = config["dataset"]["kind"]
     if schema.is_capture(kind):
         raise InputError(
@@ -68,7 +85,7 @@ def _meshes(config: dict, add) -> Nodes:
     if "scene" in config:
         motion = add("shown", schema.SCENE_MOTION, config["scene"], "motion", motion=motion)["motion"]
     about = add("about", schema.ABOUT, {}, "about", motion=motion)["about"]
-    return {"motion": motion, "about": about} | _split(config, add, motion)
+    return {"motion": motion, "about": about}
 
 
 def _captured(config: dict, add) -> Nodes:
@@ -97,6 +114,12 @@ def _split(config: dict, add, motion: Output) -> Nodes:
 def _images(config: dict, add) -> Nodes:
     loaded = add("dataset", schema.load_function(config["dataset"]["kind"]), config["dataset"], "capture views")
     return {"capture": loaded["capture"], "views": loaded["views"]}
+
+
+def _part(config: dict, add, nodes: Nodes) -> Output:
+    """The frames that are rendered where no motion is held out."""
+    part = config["scene"]["part"]
+    return nodes["motion"] if part == "all" else _split(config, add, nodes["motion"])[part]
 
 
 def _scene(config: dict, add, motion: Output) -> Nodes:

@@ -15,6 +15,7 @@ from flows.garments import plan_garment, plan_manifest
 from flows.graph import Graph, Node
 from flows.intake import Output
 from flows.source import signature
+from tasks.errors import InputError
 
 IN_VIDEOS = (("robust_lbs", "lbs"), ("fullmm",), ("partmm",))  # side by side: the first of each that was run
 PANELS = 4  # methods or variants side by side in the picture of errors
@@ -31,8 +32,8 @@ class Planned:
 
 
 def plan(case: Case, graph: Graph) -> Planned:
-    """Adds a case's stages to the graph; ``pipeline: reconstruct`` ends with rendered views, ``rig`` with the skeleton,
-    ``animate`` with unseen poses; a benchmark measures a stage against a peer."""
+    """Adds a case's stages to the graph; ``pipeline: make_scenes`` ends with images, ``reconstruct`` with views of them,
+    ``rig`` with the skeleton, ``animate`` with unseen poses; a benchmark measures a stage against a peer."""
     config = case.config
     name = f"{case.data} {case.method}" + (f" {case.variant}" if case.variant != NO_ABLATION else "")
 
@@ -46,6 +47,9 @@ def plan(case: Case, graph: Graph) -> Planned:
         return Planned(case, name, (made["metrics"][0],), made)
     if config["pipeline"] in schema.BENCHMARKS:
         return _benchmark(case, name, add)
+    if config["pipeline"] == "make_scenes":
+        nodes, measured = intake.scene(config, add, _file_name(name))
+        return Planned(case, name, tuple(measured), nodes)
     if config["pipeline"] == "reconstruct":
         nodes, measured = intake.reconstruct(config, add)
         return Planned(case, name, tuple(measured), nodes)
@@ -174,7 +178,9 @@ def _skeleton(settings: dict, add, train, test, canonical, skinning) -> dict[str
 
 def plan_files(planned: list[Planned], graph: Graph) -> list[Output]:
     """The files that the report brings along."""
-    found = [output for p in planned if "skinning" in p.nodes for output in _exports(p, graph)]
+    character = ("skinning", "reconstruction")
+    found = [output for p in planned if any(n in p.nodes for n in character) for output in _exports(p, graph)]
+    found += [p.nodes["scene_files"] for p in planned if "scene_files" in p.nodes]
     made = {p.case.config["dataset"]["garment"]: p for p in planned if "garment_file" in p.nodes}
     if made:
         every = next(iter(made.values())).case.config["make"]["every"]
@@ -185,18 +191,27 @@ def plan_files(planned: list[Planned], graph: Graph) -> list[Output]:
 def _exports(planned: Planned, graph: Graph) -> list[Output]:
     """A case's character for other programs: the method's answer to unseen poses, or the training frames."""
     nodes, seed = planned.nodes, planned.case.seed
-    name = re.sub(r"[^A-Za-z0-9.-]+", "_", planned.name) + (f"_seed{seed}" if seed else "")
-    moving = {"motion": nodes["train"], "poses": nodes["poses"]}
+    name = _file_name(planned.name) + (f"_seed{seed}" if seed else "")
+    moving = {"motion": "train", "poses": "poses", "reconstruction": "reconstruction"}
     if "animation" in nodes:
-        moving = {"motion": nodes["test"], "poses": nodes["query"], "animation": nodes["animation"]}
-    values = {n: nodes[n] for n in ("canonical", "skinning", "skeleton")} | moving
+        moving = {"motion": "test", "poses": "query", "reconstruction": "posed", "animation": "animation"}
+    values = {n: n for n in ("canonical", "skinning", "skeleton")} | moving
+    values = {n: nodes[value] for n, value in values.items() if value in nodes}
     found = []
     for kind in planned.case.config["export"]["formats"]:
         function = schema.EXPORTS[kind]
+        missing = [n for n in signature(function)[0] if n not in values and n != "animation"]
+        if missing:
+            do = "add reconstruction=cpu" if missing == ["reconstruction"] else "leave it out"
+            raise InputError("export.formats", expected="what this run makes", found=f"{kind}: no {missing[0]}", do=do)
         inputs = {n: values[n] for n in signature(function)[0] if n in values}
         node = graph.add("export", function, {"name": name}, outputs=("files",), case=planned.name, **inputs)
         found.append(node["files"])
     return found
+
+
+def _file_name(text: str) -> str:
+    return re.sub(r"[^A-Za-z0-9.-]+", "_", text)
 
 
 def plan_pictures(planned: list[Planned], graph: Graph) -> list[Node]:

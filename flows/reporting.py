@@ -64,6 +64,7 @@ BENCHMARKS = {
         },
     ),
 }
+SCENES = ("images_count", "views_count", "frames_count", "fill_pct", "on_subject_pct")
 CLOTH = ("deep_pct", "depth_995", "strain_p99_pct", "speed_max", "frames_count")
 TRUTH = ("joint_f1", "joint_f1_fine", "link_f1", "j2j_pct", "j2b_pct", "b2b_pct")
 
@@ -200,7 +201,7 @@ def tables_of(cases: list[Case], rows, remarks: list[str], said: list[str]) -> l
     """The tables of an experiment, from its cases' configs and the rows of its metrics.csv. remarks: on the data; said:
     of the run."""
     from tasks.evaluation.rows import with_means
-    from tasks.evaluation.tables import build
+    from tasks.evaluation.tables import build, unranked
 
     paper, settings = _paper(), cases[0].config["report"]
     data_status, stands_for = _places(cases, rows)
@@ -215,6 +216,10 @@ def tables_of(cases: list[Case], rows, remarks: list[str], said: list[str]) -> l
     }
     if cases[0].config["pipeline"] == "make_garments":
         return _garment_tables(rows, settings, remarks, common)
+    if cases[0].config["pipeline"] == "make_scenes":
+        notes = [*([settings["note"]] if settings["note"] else []), *remarks, *said]
+        common |= {"data_status": {}, "stands_for": {}, "baselines": []}
+        return [unranked(build(rows, title=settings["title"], metrics=SCENES, notes=notes, **common))]
     if cases[0].config["pipeline"] in BENCHMARKS:
         return _benchmark_tables(cases, rows, settings, common)
     notes = [*_notes(cases, settings), *said]

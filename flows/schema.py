@@ -35,6 +35,9 @@ DATABASE = "tasks.motion.database:build_database"
 PARTS = "tasks.motion.parts:find_parts"
 SCENE_MOTION = "tasks.captures.scenes:scene_motion"
 SCENE = "tasks.captures.scenes:render_scene"
+SCENE_FILES = "tasks.captures.scenes:scene_files"
+EVALUATE_SCENE = "tasks.evaluation.scenes:evaluate_scene"
+SCENE_PICTURE = "tasks.evaluation.pictures:scene_picture"
 FIT = "tasks.reconstruction.fit:fit"
 TRAJECTORIES = "tasks.reconstruction.motion:motion_of"
 ANCHORED = "tasks.reconstruction.anchors:anchored"
@@ -74,11 +77,14 @@ EXPORTS = {
     "skeleton_glb": "tasks.export.character:skeleton_glb",
     "bvh": "tasks.export.character:skeleton_bvh",
     "npz": "tasks.export.character:points_npz",
+    "ply": "tasks.export.splat_files:gaussians_ply",
+    "splat": "tasks.export.splat_files:gaussians_splat",
+    "rigged_ply": "tasks.export.splat_files:rigged_ply",
 }
 PER_CLIP = ("clip", "cycles", "turn", "slow")  # settings of a motion that differ from clip to clip
 PER_RUN = ("fps", "frames")  # settings of garments that several stages share
 
-PIPELINES = ("animate", "rig", "reconstruct", "make_garments", *BENCHMARKS)
+PIPELINES = ("animate", "rig", "reconstruct", "make_garments", "make_scenes", *BENCHMARKS)
 
 REPORT = {
     "name": str,
@@ -157,7 +163,7 @@ def schema(config: dict, sweep: dict[str, object]) -> dict[str, object]:
         **_method(config),
         "evaluate": settings(EVALUATE) | settings(EVALUATE_RIG) | LEFT_OUT,
         "report": REPORT,
-        "export": {"formats": list[Literal["glb", "skeleton_glb", "bvh", "npz"]]},
+        "export": {"formats": list[Literal[tuple(EXPORTS)]]},
         "store": {"path": str},
         "memory": {"max_gb": float | None},
         "runner": {"kind": Literal["threads", "processes"], "workers": int},
@@ -168,13 +174,20 @@ def schema(config: dict, sweep: dict[str, object]) -> dict[str, object]:
 def _images(config: dict) -> dict[str, object]:
     """The fit of Gaussians, and where there is one, what is rendered for it and of it."""
     reconstruction: dict[str, object] = {"kind": Literal["none", "fit"]}
+    if config["pipeline"] == "make_scenes":
+        return {"reconstruction": {"kind": Literal["none"]}, "scene": _scene()}
     if config["reconstruction"].get("kind") != "fit":
         return {"reconstruction": reconstruction}
     return {
         "reconstruction": reconstruction | settings(FIT) | settings(TRAJECTORIES),
-        "scene": {"part": Literal["all", "train", "test"], **settings(SCENE_MOTION), **settings(SCENE)},
+        "scene": _scene(),
         "views": settings(RENDER) | settings(EVALUATE_VIEWS),
     }
+
+
+def _scene() -> dict[str, object]:
+    """Which frames are rendered, and how."""
+    return {"part": Literal["all", "train", "test"], **settings(SCENE_MOTION), **settings(SCENE)}
 
 
 def _method(config: dict) -> dict[str, object]:
@@ -187,7 +200,7 @@ def _method(config: dict) -> dict[str, object]:
         own = {"benchmark": {n: t for n, t in settings(benchmark).items() if n not in OF_STAGES}}
         if config["pipeline"] != "benchmark_matching":
             return {"animate": labels} | own
-    if config["pipeline"] == "reconstruct":
+    if config["pipeline"] in ("reconstruct", "make_scenes"):
         return {"animate": labels}
     function = animate_function(config["animate"].get("function", ""))
     method = {"animate": labels | {"function": str, **settings(function)}, "parts": settings(PARTS)}

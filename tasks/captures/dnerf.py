@@ -19,7 +19,7 @@ from typing import Literal
 import numpy as np
 
 from tasks.captures import validate
-from tasks.captures.files import read_json, read_stack, write_image
+from tasks.captures.files import png, read_json, read_stack, write_files
 from tasks.errors import InputError
 from tasks.values import Capture
 
@@ -133,31 +133,38 @@ class _Half:
 
 
 def write_dnerf(train: Capture, test: Capture, folder: Path) -> None:
-    """Writes both captures in the layout above, +Z up; the validation half repeats the test half.
+    """Writes :func:`dnerf_files` below a folder."""
+    write_files(dnerf_files(train, test), folder)
+
+
+def dnerf_files(train: Capture, test: Capture) -> dict[str, bytes]:
+    """Both captures in the layout above, +Z up, by paths; the validation half repeats the test half.
 
     Clips, rig and unit have no place in it. Raises InputError for cameras whose intrinsics differ or whose pixels are
     not square, for which it has none either.
     """
+    files: dict[str, bytes] = {}
     for split, capture in (("train", train), ("test", test)):
-        k = capture.intrinsics.astype(np.float64)
-        height, width = capture.size
-        centred = np.allclose(k[:, :2, 2], [width / 2, height / 2], atol=1e-3)
-        if not (centred and np.allclose(k[:, 0, 0], k[:, 1, 1], rtol=1e-6) and np.ptp(k[:, 0, 0]) < 1e-6 * k[0, 0, 0]):
-            do = "write it with write_multiview"
-            raise InputError(
-                f"capture {capture.name}", expected="one centred camera", found="several intrinsics", do=do
-            )
         frames = []
-        (folder / split).mkdir(parents=True, exist_ok=True)
         for i, image in enumerate(capture.images):
-            write_image(folder / split / f"r_{i:03d}.png", image)
+            files[f"{split}/r_{i:03d}.png"] = png(image)
             matrix = UP["z"].T @ np.linalg.inv(capture.view[i].astype(np.float64)) @ TO_OPENCV
             time = round(float(capture.times[capture.frame[i]]), 9)
             frames.append({"file_path": f"./{split}/r_{i:03d}", "time": time, "transform_matrix": matrix.tolist()})
-        angle = 2 * np.arctan(width / 2 / k[0, 0, 0])
-        text = json.dumps({"camera_angle_x": float(angle), "fps": capture.fps, "frames": frames}, indent=1)
+        about = {"camera_angle_x": _angle(capture), "fps": capture.fps, "frames": frames}
         for name in (split, "val") if split == "test" else (split,):
-            (folder / f"transforms_{name}.json").write_text(text + "\n", "utf-8")
+            files[f"transforms_{name}.json"] = (json.dumps(about, indent=1) + "\n").encode()
+    return files
+
+
+def _angle(capture: Capture) -> float:
+    """The field of view that all images share, in radians."""
+    k, (height, width) = capture.intrinsics.astype(np.float64), capture.size
+    centred = np.allclose(k[:, :2, 2], [width / 2, height / 2], atol=1e-3)
+    if not (centred and np.allclose(k[:, 0, 0], k[:, 1, 1], rtol=1e-6) and np.ptp(k[:, 0, 0]) < 1e-6 * k[0, 0, 0]):
+        do = "write it with write_multiview"
+        raise InputError(capture.name, expected="one centred camera", found="several intrinsics", do=do)
+    return float(2 * np.arctan(width / 2 / k[0, 0, 0]))
 
 
 def world_to_camera(camera_to_world: np.ndarray, world: np.ndarray) -> np.ndarray:

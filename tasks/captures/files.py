@@ -38,10 +38,17 @@ def read_mask(path: Path) -> np.ndarray:
     return image[:, :, 3] if alpha else image[:, :, :3].max(2)
 
 
-def write_image(path: Path, image: np.ndarray) -> None:
-    """Writes RGBA (H, W, 4) or grey (H, W) uint8 as PNG."""
+def png(image: np.ndarray) -> bytes:
+    """RGBA (H, W, 4) or grey (H, W) uint8 as a PNG file."""
     order = image if image.ndim == 2 else image[:, :, [2, 1, 0, 3]]
-    path.write_bytes(cv2.imencode(".png", order)[1].tobytes())
+    return cv2.imencode(".png", order)[1].tobytes()
+
+
+def write_files(files: dict[str, bytes], folder: Path) -> None:
+    """Writes files by their paths below a folder."""
+    for path, data in files.items():
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        (folder / path).write_bytes(data)
 
 
 def resize(image: np.ndarray, height: int, width: int) -> np.ndarray:

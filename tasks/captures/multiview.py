@@ -15,7 +15,8 @@ ordered by the numbers in their names; every camera has every frame.
 
 skeleton.npz: names (J,), parents (J,) int, -1 for the root, which is joint 0, every parent before its children;
 joints (J, 3) at rest; rotations (F, J, 3) rotation vectors in radians, or (F, J, 3, 3), local to the parent and
-relative to rest (SMPL's `global_orient` and `body_pose`); root (F, 3), the shift of the root joint in the world.
+relative to rest (SMPL's `global_orient` and `body_pose`); root (F, 3), the shift of the root joint in the world, or
+instead translations (F, J, 3), those of all joints in their parents' frames, where the skeleton stretches.
 
 DNA-Rendering: K and RT of each camera in the annotation file; RT is camera to world, so invert it; undistort by D;
 masks and SMPL-X parameters lie beside them. ActorsHQ: calibration.csv gives rotation vector and translation of each
@@ -24,6 +25,7 @@ camera and its focal lengths and centre as shares of the image's size; masks com
 
 from __future__ import annotations
 
+import io
 import json
 import re
 import zipfile
@@ -34,7 +36,7 @@ from typing import Literal
 import numpy as np
 
 from tasks.captures import validate
-from tasks.captures.files import read_json, read_mask, read_stack, write_image
+from tasks.captures.files import png, read_json, read_mask, read_stack, write_files
 from tasks.errors import InputError
 from tasks.geometry.rotations import from_rotation_vector
 from tasks.values import Capture, Rig
@@ -201,42 +203,53 @@ def _unit(folder: Path, meta: dict) -> str:
 
 
 def _rig(file: Path, frames: int) -> Rig:
-    keys = ("names", "parents", "joints", "rotations", "root")
-    try:
-        with np.load(file, allow_pickle=False) as archive:
-            data = {k: archive[k] for k in keys}
-    except UNREADABLE as error:
-        found = " ".join(str(error).split())[:120]
-        raise InputError(str(file), expected=f"plain arrays {', '.join(keys)}", found=found) from None
+    data = _arrays(file)
     joints = len(data["names"])
-    turns = data["rotations"]
-    if turns.ndim == 3:
-        turns = from_rotation_vector(turns.astype(np.float64))
-    given = {**data, "rotations": turns}
-    shapes = {"parents": (joints,), "joints": (joints, 3), "rotations": (frames, joints, 3, 3), "root": (frames, 3)}
+    if data["rotations"].ndim == 3:
+        data["rotations"] = from_rotation_vector(data["rotations"].astype(np.float64))
+    shapes = {"parents": (joints,), "joints": (joints, 3), "rotations": (frames, joints, 3, 3)}
+    shapes |= {"translations": (frames, joints, 3)} if "translations" in data else {"root": (frames, 3)}
     for key, shape in shapes.items():
-        if given[key].shape != shape or given[key].dtype.kind not in "fiu" or not np.isfinite(given[key]).all():
-            found = f"{given[key].dtype} {given[key].shape}"
+        if data[key].shape != shape or data[key].dtype.kind not in "fiu" or not np.isfinite(data[key]).all():
+            found = f"{data[key].dtype} {data[key].shape}"
             raise InputError(f"{file}: {key}", expected=f"finite numbers {shape}", found=found)
     parents = data["parents"]
     if joints == 0 or parents[0] != -1 or not all(0 <= p < j for j, p in enumerate(parents[1:], start=1)):
         expected = "one root at index 0 and every parent before its children"
         raise InputError(f"{file}: parents", expected=expected, found=str(parents.tolist()))
-    shift = np.zeros((frames, joints, 3), np.float32)
-    shift[:, 0] = data["root"]
+    shift = data.get("translations", np.zeros((frames, joints, 3))).astype(np.float32)
+    if "root" in shapes:
+        shift[:, 0] = data["root"]
     return Rig(
         names=tuple(str(n) for n in data["names"]),
         parents=parents.astype(np.int32),
         joints=data["joints"].astype(np.float32),
         weights=np.zeros((0, joints), np.float32),
-        rotations=turns.astype(np.float32),
+        rotations=data["rotations"].astype(np.float32),
         translations=shift,
     )
 
 
+def _arrays(file: Path) -> dict[str, np.ndarray]:
+    """The arrays of a skeleton.npz. Raises InputError for a damaged file and where one is missing."""
+    try:
+        with np.load(file, allow_pickle=False) as archive:
+            keys = ("names", "parents", "joints", "rotations", "translations" if "translations" in archive else "root")
+            return {k: archive[k] for k in keys}
+    except UNREADABLE as error:
+        expected = "plain arrays names, parents, joints, rotations, root"
+        raise InputError(str(file), expected=expected, found=" ".join(str(error).split())[:120]) from None
+
+
 def write_multiview(train: Capture, test: Capture, folder: Path) -> None:
-    """Writes both captures in the layout above, alpha in the images. Raises InputError where a camera moves or misses a
-    frame, and where joints of the rig but the root shift, for which the layout has no place."""
+    """Writes :func:`multiview_files` below a folder."""
+    write_files(multiview_files(train, test), folder)
+
+
+def multiview_files(train: Capture, test: Capture) -> dict[str, bytes]:
+    """Both captures in the layout above by paths, alpha in the images. Raises InputError where a camera moves or misses
+    a frame."""
+    files: dict[str, bytes] = {}
     cameras = []
     for split, capture in (("train", train), ("test", test)):
         for c in np.unique(capture.camera):
@@ -244,17 +257,16 @@ def write_multiview(train: Capture, test: Capture, folder: Path) -> None:
             shots = shots[np.argsort(capture.frame[shots], kind="stable")]
             _check_standing(capture, shots, len(train.times))
             name = f"{split}{c:02d}"
-            (folder / "frames" / name).mkdir(parents=True, exist_ok=True)
-            for f, i in enumerate(shots):
-                write_image(folder / "frames" / name / f"{f:06d}.png", capture.images[i])
+            files |= {f"frames/{name}/{f:06d}.png": png(capture.images[i]) for f, i in enumerate(shots)}
             k, view = capture.intrinsics[shots[0]].tolist(), capture.view[shots[0]].tolist()
             cameras.append({"name": name, "split": split, "intrinsics": k, "world_to_camera": view})
     starts = zip(train.clip_names, train.clip_start[:-1].tolist(), strict=True)
     clips = [{"name": name, "start": start} for name, start in starts]
     meta = {"fps": train.fps, "unit": train.unit, "cameras": cameras, "clips": clips}
-    (folder / "cameras.json").write_text(json.dumps(meta, indent=1) + "\n", "utf-8")
+    files["cameras.json"] = (json.dumps(meta, indent=1) + "\n").encode()
     if train.rig is not None:
-        _write_rig(train.rig, folder / "skeleton.npz")
+        files["skeleton.npz"] = _rig_file(train.rig)
+    return files
 
 
 def _check_standing(capture: Capture, shots: np.ndarray, frames: int) -> None:
@@ -265,14 +277,9 @@ def _check_standing(capture: Capture, shots: np.ndarray, frames: int) -> None:
         raise InputError(capture.name, expected="cameras that stand still", found="a moving one", do="use write_dnerf")
 
 
-def _write_rig(rig: Rig, file: Path) -> None:
-    if np.abs(rig.translations[:, 1:]).max(initial=0.0) > 0:
-        raise InputError(str(file), expected="joints at fixed offsets", found="joints that shift")
-    np.savez(
-        file,
-        names=np.array(rig.names),
-        parents=rig.parents,
-        joints=rig.joints,
-        rotations=rig.rotations,
-        root=rig.translations[:, 0],
-    )
+def _rig_file(rig: Rig) -> bytes:
+    stream = io.BytesIO()
+    arrays = {"parents": rig.parents, "joints": rig.joints, "rotations": rig.rotations}
+    arrays |= {"translations": rig.translations}
+    np.savez(stream, names=np.array(rig.names), **arrays)
+    return stream.getvalue()

@@ -8,10 +8,12 @@ from typing import Literal
 import numpy as np
 
 from tasks.captures import cameras as cam
+from tasks.captures.dnerf import dnerf_files
+from tasks.captures.multiview import multiview_files
 from tasks.captures.raycast import Caster
 from tasks.errors import InputError
 from tasks.geometry.measure import diagonal
-from tasks.values import Capture, Motion, Rig
+from tasks.values import Capture, Files, Motion, Rig
 
 PROBES = 16  # views that the framing is measured on
 PROBE_SIZE = 64  # their pixels
@@ -99,6 +101,14 @@ def render_scene(
     views = [_views(s, targets, d) for s, d in zip((train, test), distances, strict=True)]
     pixels = {"size": size, "samples": samples, "shading": shading}
     return tuple(_capture(motion, s, v, intrinsics, pixels) for s, v in zip((train, test), views, strict=True))
+
+
+def scene_files(capture: Capture, views: Capture, *, name: str) -> Files:
+    """A scene as a folder that other programs read: in the layout of D-NeRF, or where cameras stand still in that of
+    ``tasks/captures/multiview.py``. capture: to train on; views: held out."""
+    standing = len(np.unique(capture.camera)) < len(capture.camera)
+    files = multiview_files(capture, views) if standing else dnerf_files(capture, views)
+    return Files.of({f"{name}/{path}": data for path, data in files.items()})
 
 
 class _Shots:

@@ -98,6 +98,12 @@ METRICS: dict[str, Metric] = {
     "points_exponent": Metric("growth with points", "ratio", "lower", "time ~ points ^ this: 1 is linear", 2),
     "frames_exponent": Metric("growth with frames", "ratio", "lower", "time ~ frames ^ this", 2),
     "points_count": Metric("points", "count", "none", "points; of a series of runs, in its largest", 0),
+    "images_count": Metric("training images", "count", "none", "images to train on", 0),
+    "views_count": Metric("held-out images", "count", "none", "images of views that are held out", 0),
+    "fill_pct": Metric("filled", "percent", "none", "share of the training images that the subject covers", 1),
+    "on_subject_pct": Metric(
+        "vertices on the subject", "percent", "higher", "vertices whose pixel, or one beside it, is covered", 2
+    ),
     "frames_count": Metric("frames", "count", "none", "frames; of a series of runs, in its largest", 0),
     "deep_pct": Metric("inside", "percent", "lower", "cloth vertices more than 2 mm inside the body", 3),
     "depth_995": Metric("depth", "length", "lower", "99.5 % of the cloth is no deeper inside; negative: outside", 2),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tasks.evaluation import figures, render, video
-from tasks.evaluation.views import views_figure
+from tasks.evaluation.views import contact_sheet, views_figure
 from tasks.geometry import kinematics, measure
 from tasks.geometry.skinning import skin
 from tasks.values import Animation, Canonical, Capture, Clusters, Motion, Parts, Picture, Poses, Skeleton, Skinning
@@ -68,6 +68,11 @@ def garment_picture(body: Motion, poses: dict[str, Poses], cloth: dict[str, Moti
 def views_picture(truth: Capture, rendered: dict[str, Capture]) -> Picture:
     """What test cameras saw and what is rendered for them."""
     return Picture("views", f"{truth.name}: held-out views and their renderings", _png(views_figure(truth, rendered)))
+
+
+def scene_picture(capture: Capture, views: Capture) -> Picture:
+    """A rendered scene: training images over time, and held-out views."""
+    return Picture("scene", f"{capture.name}: training images, and views held out", _png(contact_sheet(capture, views)))
 
 
 def _png(pixels: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ SIDE = 240  # of a picture, in pixels
 CAPTION = 22
 GAIN = 4.0  # differences are shown so many times as strong
 ROWS = 3
+SHEET, SHEET_ROWS, THUMB = 8, 3, 120  # images in a row, rows of training images, pixels of each
 
 
 def views_figure(truth: Capture, rendered: Mapping[str, Capture], *, theme: str = "light") -> np.ndarray:
@@ -40,6 +41,28 @@ def views_figure(truth: Capture, rendered: Mapping[str, Capture], *, theme: str 
             top, left = (CAPTION + r * SIDE) * scale, c * SIDE * scale
             canvas[top : top + SIDE * scale, left : left + SIDE * scale] = render.to_bytes(big)
     return render.finish(canvas)
+
+
+def contact_sheet(capture: Capture, views: Capture, *, theme: str = "light") -> np.ndarray:
+    """A row of held-out views below rows of training images, evenly over time -> (H', W', 3) uint8 RGB."""
+    rows = [(capture, n) for n in np.array_split(_evenly(len(capture.images), SHEET_ROWS * SHEET), SHEET_ROWS)]
+    rows.append((views, _evenly(len(views.images), SHEET)))
+    pictures = [on_background(source, chosen) for source, chosen in rows]
+    canvas = render.blank(SHEET * THUMB, len(rows) * THUMB + CAPTION, theme)
+    scale = render.SUPERSAMPLE
+    for r, images in enumerate(pictures):
+        top = (r * THUMB + (CAPTION if r == len(rows) - 1 else 0)) * scale
+        for c, image in enumerate(images):
+            big = cv2.resize(image, (THUMB * scale, THUMB * scale), interpolation=cv2.INTER_AREA)
+            left = c * THUMB * scale
+            canvas[top : top + THUMB * scale, left : left + THUMB * scale] = render.to_bytes(big)
+    line = (len(rows) - 1) * THUMB + CAPTION - 7
+    render.text(canvas, "held out", (SHEET * THUMB / 2, line), align="middle", theme=theme, room=SHEET * THUMB)
+    return render.finish(canvas)
+
+
+def _evenly(count: int, wanted: int) -> np.ndarray:
+    return np.unique(np.linspace(0, count - 1, min(count, wanted)).round().astype(int))
 
 
 def on_background(capture: Capture, chosen: np.ndarray) -> np.ndarray:

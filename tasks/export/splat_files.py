@@ -8,7 +8,10 @@ harmonics beyond degree 0, half a grey level and half a degree of rounding.
 
 from __future__ import annotations
 
+import io
 import json
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -16,8 +19,9 @@ import numpy as np
 
 from tasks.errors import InputError
 from tasks.geometry.gaussians import at_frame
-from tasks.values import Gaussians, Poses, Reconstruction, Skeleton, Skinning
+from tasks.values import Animation, Files, Gaussians, Poses, Reconstruction, Skeleton, Skinning
 
+FOLDER = "export"  # in a report
 C0 = 0.28209479177387814  # the basis function of degree 0
 SURE = 1e-6  # opacities nearer to 0 or 1 than this have no finite logit in the file
 TYPES = {"float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8", "uchar": "u1", "uint8": "u1"}
@@ -44,54 +48,72 @@ def read_gaussians(path: str | Path) -> Gaussians:
 
 def write_gaussians(gaussians: Gaussians, path: str | Path) -> None:
     """Writes a .ply or .splat file, as its name ends. Raises InputError for another ending."""
-    kinds = {".ply": _to_ply, ".splat": _to_splat}
     file = Path(path)
-    if file.suffix.lower() not in kinds:
+    if file.suffix.lower().lstrip(".") not in WRITERS:
         raise InputError(str(path), expected="a name that ends in .ply or .splat", found=file.name)
     file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_bytes(kinds[file.suffix.lower()](gaussians))
+    file.write_bytes(_bytes(gaussians, file.suffix.lower().lstrip(".")))
+
+
+def gaussians_ply(reconstruction: Reconstruction, *, name: str) -> Files:
+    """The canonical Gaussians and those of every frame as .ply files; see :func:`reconstruction_files`."""
+    return Files.of({f"{FOLDER}/{name}/{path}": data for path, data in reconstruction_files(reconstruction, "ply")})
+
+
+def gaussians_splat(reconstruction: Reconstruction, *, name: str) -> Files:
+    """The canonical Gaussians and those of every frame as .splat files; see :func:`reconstruction_files`."""
+    return Files.of({f"{FOLDER}/{name}/{path}": data for path, data in reconstruction_files(reconstruction, "splat")})
 
 
 def export_reconstruction(reconstruction: Reconstruction, folder: Path, *, format: Literal["ply", "splat"]) -> None:
-    """Writes the canonical Gaussians, those of every frame, and when each frame is.
+    """Writes :func:`reconstruction_files` below a folder."""
+    for path, data in reconstruction_files(reconstruction, format):
+        file = folder / path
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(data)
 
-    FOLDER/canonical.FORMAT, FOLDER/frames/000000.FORMAT, …, FOLDER/motion.json: fps, unit, times and clips.
+
+def reconstruction_files(reconstruction: Reconstruction, format: str) -> Iterator[tuple[str, bytes]]:
+    """The canonical Gaussians, those of every frame, and when each frame is, as (path, bytes).
+
+    canonical.FORMAT, frames/000000.FORMAT, …, motion.json: fps, unit, times and clips.
     """
-    write_gaussians(reconstruction.gaussians, folder / f"canonical.{format}")
+    yield f"canonical.{format}", _bytes(reconstruction.gaussians, format)
     for f in range(len(reconstruction.points)):
-        write_gaussians(at_frame(reconstruction, f), folder / "frames" / f"{f:06d}.{format}")
+        yield f"frames/{f:06d}.{format}", _bytes(at_frame(reconstruction, f), format)
     starts = reconstruction.clip_start[:-1].tolist()
     clips = [{"name": n, "start": s} for n, s in zip(reconstruction.clip_names, starts, strict=True)]
     about = {"name": reconstruction.name, "fps": reconstruction.fps, "unit": reconstruction.unit, "clips": clips}
     about["times"] = [round(float(t), 7) for t in reconstruction.times]
-    (folder / "motion.json").write_text(json.dumps(about, indent=1) + "\n", "utf-8")
+    yield "motion.json", (json.dumps(about, indent=1) + "\n").encode()
 
 
-def export_rigged(
+def rigged_ply(
     reconstruction: Reconstruction,
     skinning: Skinning,
     skeleton: Skeleton,
     poses: Poses,
-    folder: Path,
+    animation: Animation | None = None,
     *,
-    format: Literal["ply", "splat"],
-) -> None:
-    """Writes the canonical Gaussians and what moves them, a row of the rig for each Gaussian.
+    name: str,
+) -> Files:
+    """The canonical Gaussians and what moves them, a row of the rig for each Gaussian.
 
-    FOLDER/canonical.FORMAT with its means at ``skinning.rest``, and FOLDER/rig.npz, plain arrays: of the bones weights
-    (N, B) and transforms (F, B, 3, 4) on canonical points; of the skeleton joint_names (J,), joint_parents (J,),
-    joints (J, 3), joint_weights (N, J), rotations (F, J, 3, 3), translations (F, J, 3), clip_start (C+1,).
+    canonical.ply with its means at ``skinning.rest``, and rig.npz, plain arrays: of the bones weights (N, B) and
+    transforms (F, B, 3, 4) on canonical points; of the skeleton joint_names (J,), joint_parents (J,), joints (J, 3),
+    joint_weights (N, J), rotations (F, J, 3, 3), translations (F, J, 3), clip_start (C+1,). With an animation the
+    transforms are its bones, and are left out for a method that moves none.
     Raises ValueError where the rig is of other points.
     """
     gaussians = reconstruction.gaussians
     if len(skinning.rest) != len(gaussians.means):
         raise ValueError(f"{len(skinning.rest)} points of the rig against {len(gaussians.means)} Gaussians")
-    at_rest = Gaussians(skinning.rest, gaussians.scales, gaussians.quaternions, gaussians.opacities, gaussians.sh)
-    write_gaussians(at_rest, folder / f"canonical.{format}")
+    moved = skinning.transforms if animation is None else animation.bones
+    stream = io.BytesIO()
     np.savez_compressed(
-        folder / "rig.npz",
+        stream,
+        **({} if moved is None else {"transforms": moved}),
         weights=skinning.weights,
-        transforms=skinning.transforms,
         joint_names=np.array(skeleton.names),
         joint_parents=skeleton.parents,
         joints=skeleton.joints,
@@ -100,6 +122,12 @@ def export_rigged(
         translations=poses.translations,
         clip_start=poses.clip_start,
     )
+    at_rest = _bytes(replace(gaussians, means=skinning.rest), "ply")
+    return Files.of({f"{FOLDER}/{name}/canonical.ply": at_rest, f"{FOLDER}/{name}/rig.npz": stream.getvalue()})
+
+
+def _bytes(gaussians: Gaussians, format: str) -> bytes:
+    return WRITERS[format](gaussians)
 
 
 def _to_ply(gaussians: Gaussians) -> bytes:
@@ -195,3 +223,6 @@ def _quaternions(gaussians: Gaussians) -> np.ndarray:
     if gaussians.quaternions is None:
         return np.tile(np.array([1, 0, 0, 0], np.float32), (len(gaussians.means), 1))
     return gaussians.quaternions
+
+
+WRITERS = {"ply": _to_ply, "splat": _to_splat}

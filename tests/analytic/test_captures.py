@@ -81,7 +81,7 @@ def handmade(folder, **top):
         for i, matrix in enumerate((front, side)):
             image = np.zeros((60, 80, 4), np.uint8)
             image[20:40, 30:50] = (255, 0, 0, 255)
-            files.write_image(folder / split / f"r_{i}.png", image)
+            (folder / split / f"r_{i}.png").write_bytes(files.png(image))
             frames.append({"file_path": f"./{split}/r_{i}", "transform_matrix": matrix})
         content = {"camera_angle_x": float(2 * np.arctan(0.5)), "frames": frames} | top
         (folder / f"transforms_{split}.json").write_text(json.dumps(content))
@@ -184,7 +184,7 @@ def test_missing_and_damaged_files_are_one_line(tmp_path, scene):
 
 def test_images_of_another_size_or_without_alpha_are_one_line(scene, monocular):
     image = monocular[0].images[4]
-    files.write_image(scene / "train" / "r_004.png", image[:-1])
+    (scene / "train" / "r_004.png").write_bytes(files.png(image[:-1]))
     refused(lambda: load(scene), "r_004.png", "48 x 47", "48 x 48")
     cv2.imwrite(str(scene / "train" / "r_004.png"), image[..., :3])
     refused(lambda: load(scene), "alpha", "r_004.png")

@@ -16,8 +16,10 @@ from tasks.errors import InputError
 from tasks.export.splat_files import (
     C0,
     export_reconstruction,
-    export_rigged,
+    gaussians_ply,
+    gaussians_splat,
     read_gaussians,
+    rigged_ply,
     write_gaussians,
 )
 from tasks.geometry.gaussians import at_frame
@@ -184,6 +186,10 @@ def test_a_reconstruction_is_one_file_a_frame(tmp_path, kind):
         found = read_gaussians(file)
         assert np.array_equal(found.means, made.points[f])
         np.testing.assert_allclose(found.scales, at_frame(made, f).scales, rtol=1e-5)
+    brought = {"ply": gaussians_ply, "splat": gaussians_splat}[kind](made, name="thing").items()
+    assert {(p.removeprefix("export/thing/"), d) for p, d in brought} == {
+        (str(f.relative_to(tmp_path)), f.read_bytes()) for f in tmp_path.rglob("*.*")
+    }
     assert np.array_equal(read_gaussians(tmp_path / f"canonical.{kind}").means, made.gaussians.means)
     about = json.loads((tmp_path / "motion.json").read_text())
     assert about["clips"] == [{"name": "one", "start": 0}, {"name": "two", "start": 2}]
@@ -197,11 +203,14 @@ def test_a_rig_goes_with_its_gaussians(tmp_path):
     skinning = Skinning(made.points[0], weights, bones, np.zeros(0))
     skeleton = Skeleton(("a", "b"), np.array([-1, 0]), np.zeros((2, 3)), weights)
     poses = Poses(np.zeros((3, 2, 3, 3)), np.zeros((3, 2, 3)), made.clip_start)
-    export_rigged(made, skinning, skeleton, poses, tmp_path, format="ply")
-    assert np.array_equal(read_gaussians(tmp_path / "canonical.ply").means, made.points[0])
-    with np.load(tmp_path / "rig.npz", allow_pickle=False) as rig:
+    for path, data in rigged_ply(made, skinning, skeleton, poses, name="thing").items():
+        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / path).write_bytes(data)
+    folder = tmp_path / "export" / "thing"
+    assert np.array_equal(read_gaussians(folder / "canonical.ply").means, made.points[0])
+    with np.load(folder / "rig.npz", allow_pickle=False) as rig:
         assert np.array_equal(rig["transforms"], bones)
         assert rig["joint_names"].tolist() == ["a", "b"]
     few = Skinning(made.points[0][:4], weights[:4], bones, np.zeros(0))
     with pytest.raises(ValueError, match="4 points of the rig"):
-        export_rigged(made, few, skeleton, poses, tmp_path, format="ply")
+        rigged_ply(made, few, skeleton, poses, name="thing")

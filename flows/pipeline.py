@@ -32,7 +32,7 @@ class Planned:
 
 
 def plan(case: Case, graph: Graph) -> Planned:
-    """Adds a case's stages to the graph; ``pipeline: make_scenes`` ends with images, ``reconstruct`` with views of them,
+    """Adds a case's stages to the graph; ``pipeline: make_scenes`` ends with images, ``reconstruct`` with what is seen,
     ``rig`` with the skeleton, ``animate`` with unseen poses; a benchmark measures a stage against a peer."""
     config = case.config
     name = f"{case.data} {case.method}" + (f" {case.variant}" if case.variant != NO_ABLATION else "")

@@ -174,20 +174,13 @@ def schema(config: dict, sweep: dict[str, object]) -> dict[str, object]:
 def _images(config: dict) -> dict[str, object]:
     """The fit of Gaussians, and where there is one, what is rendered for it and of it."""
     reconstruction: dict[str, object] = {"kind": Literal["none", "fit"]}
-    if config["pipeline"] == "make_scenes":
-        return {"reconstruction": {"kind": Literal["none"]}, "scene": _scene()}
     if config["reconstruction"].get("kind") != "fit":
         return {"reconstruction": reconstruction}
     return {
         "reconstruction": reconstruction | settings(FIT) | settings(TRAJECTORIES),
-        "scene": _scene(),
+        "scene": {"part": Literal["all", "train", "test"], **settings(SCENE_MOTION), **settings(SCENE)},
         "views": settings(RENDER) | settings(EVALUATE_VIEWS),
     }
-
-
-def _scene() -> dict[str, object]:
-    """Which frames are rendered, and how."""
-    return {"part": Literal["all", "train", "test"], **settings(SCENE_MOTION), **settings(SCENE)}
 
 
 def _method(config: dict) -> dict[str, object]:

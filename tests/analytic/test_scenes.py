@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 
 from tasks.captures import cameras as cam
+from tasks.captures import dnerf, multiview
 from tasks.captures.raycast import Caster, solid_colour
-from tasks.captures.scenes import render_scene, scene_motion
+from tasks.captures.scenes import render_scene, scene_files, scene_motion
 from tasks.errors import InputError
+from tasks.evaluation.pictures import scene_picture
+from tasks.evaluation.scenes import evaluate_scene
 from tasks.geometry.rotations import from_rotation_vector
 from tasks.values import Motion, Rig, same
 from tests.analytic.shapes import sphere
@@ -218,3 +221,30 @@ def test_wrong_settings_are_one_line(change):
 def test_bare_points_cannot_be_rendered():
     with pytest.raises(InputError, match="a mesh to render"):
         render_scene(replace(ball(), faces=None), **SCENE)
+
+
+def test_the_numbers_of_a_scene_and_its_cameras_hold_against_the_surface():
+    motion = ball(rig=True)
+    capture, views = render_scene(motion, **SCENE)
+    found = evaluate_scene(capture, views, motion)
+    numbers = dict(zip(found.names, found.values.tolist(), strict=True))
+    assert (numbers["images_count"], numbers["views_count"], numbers["frames_count"]) == (12, 4, 6)
+    assert numbers["fill_pct"] == pytest.approx(15, abs=1.5)
+    assert numbers["on_subject_pct"] == 100
+    beside = evaluate_scene(capture, views, replace(motion, points=motion.points + np.float32(0.5)))
+    assert beside.values[found.names.index("on_subject_pct")] < 90
+    assert scene_picture(capture, views).png[:4].tobytes() == b"\x89PNG"
+
+
+@pytest.mark.parametrize(("layout", "reader"), [("monocular", dnerf.load), ("multiview", multiview.load)])
+def test_a_scene_is_a_folder_in_the_layout_of_its_cameras(tmp_path, layout, reader):
+    scene = render_scene(ball(rig=True), **SCENE | {"layout": layout, "fill": 0.1})
+    for path, data in scene_files(*scene, name="ball").items():
+        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / path).write_bytes(data)
+    more = {"up": "z", "fps": 1.0, "unit": "unit"} if layout == "monocular" else {}
+    for before, after in zip(
+        scene, reader(path=str(tmp_path / "ball"), size=None, background="none", **more), strict=True
+    ):
+        assert before.images.sum(dtype=np.int64) == after.images.sum(dtype=np.int64)
+        assert before.fps == after.fps

@@ -29,6 +29,7 @@ from tasks.errors import InputError, NotGiven
 CONF = ROOT / "conf"
 NO_ABLATION = "none"
 ADDED = ("experiment", "ablation")  # groups that the config does not choose from by itself: +GROUP=CHOICE
+ALONE = "again"  # the report of a case that is run again by itself
 SWEPT = ("datasets", "methods", "ablations")  # the axes of an experiment's grid
 SWEEP = dict.fromkeys(("experiments", *SWEPT), list[str] | None)
 SWEEP |= {"seeds": list[int] | None, "absent": Literal["fail", "skip"]}
@@ -36,12 +37,14 @@ SWEEP |= {"seeds": list[int] | None, "absent": Literal["fail", "skip"]}
 
 @dataclass(frozen=True)
 class Case:
-    """One row of the sweep: its labels in the tables and its whole config, as plain values."""
+    """One row of the sweep: its labels in the tables, its whole config as plain values, and the overrides that run it
+    alone, with a report of its own."""
 
     dataset: str
     method: str
     variant: str
     config: dict
+    alone: tuple[str, ...] = ()
 
     @property
     def seed(self) -> int:
@@ -162,8 +165,11 @@ def _sweep(
                 raise
             missing.append(Missing(name, str(error), config["dataset"].get("stands_for")))
             continue
+        kept = [o for o in values if o.input_line in set_here]
         for node, seed in itertools.product(nodes, _seeds(config)):
-            yield Case(name, config["animate"]["name"], variant, config | {"dataset": node, "method_seed": seed})
+            alone = _alone(chosen, ablation, kept, node.get("path"), seed)
+            filled = config | {"dataset": node, "method_seed": seed}
+            yield Case(name, config["animate"]["name"], variant, filled, alone)
 
 
 def _seeds(config: dict) -> list[int | None]:
@@ -172,6 +178,29 @@ def _seeds(config: dict) -> list[int | None]:
     if not seeds or config["method_seed"] is not None or function is None:
         return [config["method_seed"]]
     return seeds if "seed" in signature(schema.animate_function(function))[1] else seeds[:1]
+
+
+def _alone(
+    chosen: dict, ablation: str | None, values: list[Override], path: str | None, seed: int | None
+) -> tuple[str, ...]:
+    """The overrides that run one case of a sweep by itself. values: those of the command that it has."""
+    swept = {} if ablation is None else {"ablation": None}
+    groups = _group_overrides(chosen | swept)
+    ablations = f"sweep.ablations=[{ablation}]" if ablation not in (None, NO_ABLATION) else "sweep.ablations=null"
+    swept_here = {"sweep.datasets": "dataset", "sweep.methods": "method", "sweep.ablations": "ablation"}
+    axes = {axis for axis, group in swept_here.items() if (chosen | swept).get(group) or group in swept}
+    kept = [
+        o for o in values if o.key_or_group not in {"dataset.path", "report.name", "method_seed", "sweep.seeds", *axes}
+    ]
+    file = [f"dataset.path={_quoted(path)}"] if any(o.key_or_group == "dataset.path" for o in values) else []
+    lines = [*file, *(o.input_line for o in kept), *([f"method_seed={seed}"] if seed is not None else [])]
+    return (*groups, *([ablations] if ablation is not None else []), *lines, f"report.name={ALONE}")
+
+
+def _quoted(text: str | None) -> str:
+    """A value that Hydra's grammar reads back as this text."""
+    plain = text is None or re.fullmatch(r"[\w./:-]+", text)
+    return str(text) if plain else "'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'"
 
 
 def _files(dataset: dict) -> list[dict]:

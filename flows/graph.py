@@ -17,7 +17,8 @@ from flows.store import canonical_json
 
 @dataclass
 class Node:
-    """A stage with its settings and where its inputs come from. cases: the names of all cases that need it."""
+    """A stage with its settings and where its inputs come from. cases: the names of all cases that need it; title:
+    what readers call it where one kind of stage comes several times."""
 
     id: str
     stage: str
@@ -27,6 +28,7 @@ class Node:
     inputs: dict
     source: str
     files: str
+    title: str
     cases: list[str] = field(default_factory=list)
 
     def __getitem__(self, output: str) -> tuple[Node, str]:
@@ -72,15 +74,18 @@ class Graph:
         outputs: tuple[str, ...],
         case: str,
         path: str | None = None,
+        title: str | None = None,
         **inputs: object,
     ) -> Node:
-        """The node of a stage, made or found. path: an input file or folder whose bytes count in the cache key."""
+        """The node of a stage, made or found. path: an input file or folder whose bytes count in the cache key; title:
+        its name for readers, if not that of the stage."""
         files = self._digest(path) if path else ""
         described = {n: _identity(v) for n, v in inputs.items()}
         text = canonical_json([stage, function, settings, list(outputs), described, files])
         identity = hashlib.sha256(text.encode()).hexdigest()
         code = source.digest(function.split(":")[0])
-        node = self.nodes.setdefault(identity, Node(identity, stage, function, outputs, settings, inputs, code, files))
+        new = Node(identity, stage, function, outputs, settings, inputs, code, files, title or stage)
+        node = self.nodes.setdefault(identity, new)
         if case not in node.cases:
             node.cases.append(case)
         return node

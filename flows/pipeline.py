@@ -37,10 +37,11 @@ def plan(case: Case, graph: Graph) -> Planned:
     config = case.config
     name = f"{case.data} {case.method}" + (f" {case.variant}" if case.variant != NO_ABLATION else "")
 
-    def add(stage: str, function: str, node: dict, outputs: str, **inputs: object) -> Node:
+    def add(stage: str, function: str, node: dict, outputs: str, title: str | None = None, **inputs: object) -> Node:
         settings = schema.arguments(function, node, case.seed if stage == "animate" else config["seed"])
         path = settings.get("path") if stage == "dataset" else None
-        return graph.add(stage, function, settings, outputs=tuple(outputs.split()), case=name, path=path, **inputs)
+        about = {"outputs": tuple(outputs.split()), "case": name, "path": path, "title": title}
+        return graph.add(stage, function, settings, **about, **inputs)
 
     if config["pipeline"] == "make_garments":
         made = plan_garment(case, name, graph)
@@ -55,7 +56,7 @@ def plan(case: Case, graph: Graph) -> Planned:
         return Planned(case, name, tuple(measured), nodes)
     nodes = _rig(config, add)
     shared = {n: nodes[n] for n in ("train", "canonical", "skinning", "skeleton", "poses")}
-    metrics = [add("evaluate", schema.EVALUATE_RIG, config["evaluate"], "metrics", **shared)]
+    metrics = [add("evaluate", schema.EVALUATE_RIG, config["evaluate"], "metrics", "evaluate rig", **shared)]
     if config["pipeline"] == "animate":
         nodes |= _animation(config, add, nodes)
         unseen = {n: nodes[n] for n in ("animation", "test", "canonical")}
@@ -157,11 +158,11 @@ def _skeleton(settings: dict, add, train, test, canonical, skinning) -> dict[str
     if settings["kind"] == "given":
         skeleton = add("skeleton", schema.GIVEN_SKELETON, {}, "skeleton", train=train, canonical=canonical)["skeleton"]
 
-        def pose(motion):
+        def pose(motion, which: str):
             inputs = {"motion": motion, "train": train, "canonical": canonical, "skeleton": skeleton}
-            return add("poses", schema.GIVEN_POSES, {}, "poses", **inputs)["poses"]
+            return add("poses", schema.GIVEN_POSES, {}, "poses", f"poses, {which}", **inputs)["poses"]
 
-        return {"skeleton": skeleton, "poses": pose(train), "query": pose(test)}
+        return {"skeleton": skeleton, "poses": pose(train, "seen"), "query": pose(test, "unseen")}
 
     surface = add("surface", schema.SURFACE, settings["surface"], "surface", canonical=canonical)["surface"]
     curve = add("curve", schema.CURVE, settings["curve"], "curve", surface=surface)["curve"]
@@ -169,11 +170,12 @@ def _skeleton(settings: dict, add, train, test, canonical, skinning) -> dict[str
     inputs = {"train": train, "canonical": canonical, "skinning": skinning, "surface": surface, "curve": curve}
     skeleton = add("skeleton", schema.JOINTS[joints], settings[joints], "skeleton", **inputs)["skeleton"]
 
-    def fit(motion):
+    def fit(motion, which: str):
         inputs = {"motion": motion, "canonical": canonical, "skeleton": skeleton}
-        return add("poses", schema.POSES, settings["poses"], "poses", **inputs)["poses"]
+        return add("poses", schema.POSES, settings["poses"], "poses", f"poses, {which}", **inputs)["poses"]
 
-    return {"surface": surface, "curve": curve, "skeleton": skeleton, "poses": fit(train), "query": fit(test)}
+    poses = {"poses": fit(train, "seen"), "query": fit(test, "unseen")}
+    return {"surface": surface, "curve": curve, "skeleton": skeleton} | poses
 
 
 def plan_files(planned: list[Planned], graph: Graph) -> list[Output]:
@@ -275,7 +277,8 @@ def _pictures(shown: list[Planned], graph: Graph) -> list[Node]:
     def add(function: str, names: str, settings: dict | None = None, **inputs: object) -> Node:
         path = f"tasks.evaluation.pictures:{function}"
         inputs |= {n: lead.nodes[n] for n in names.split()}
-        return graph.add("figures", path, settings or {}, outputs=("picture",), case=lead.case.data, **inputs)
+        about = {"outputs": ("picture",), "case": lead.case.data, "title": function.replace("_", " ")}
+        return graph.add("figures", path, settings or {}, **about, **inputs)
 
     pictures = [
         add("skeleton_picture", "train canonical skeleton parts"),

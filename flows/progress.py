@@ -24,8 +24,8 @@ class Progress:
     Workers report the start of a stage in a file of events, since they may be other processes.
     """
 
-    def __init__(self, graph: Graph, show: bool = True, tell: Callable[[int], None] = lambda finished: None) -> None:
-        self._tell = tell
+    def __init__(self, graph: Graph, show: bool = True) -> None:
+        self.tell: Callable[[Node], None] = lambda node: None  # hears of every stage that finished
         self.total = len(graph.nodes)
         self.finished = 0
         self._start = time.monotonic()
@@ -76,7 +76,7 @@ class Progress:
     def _line(self, node: Node, how: Text, rest: str) -> None:
         with self._lock:
             self._running.pop((node.stage, short(node.cases)), None)
-        self._tell(self.finished)
+        self.tell(node)
         more = f" (+{len(node.cases) - 1} cases)" if len(node.cases) > 1 else ""
         count = f"[{self.finished:{len(str(self.total))}}/{self.total}] "
         self.console.print(Text.assemble((count, "dim"), how, f" {node.stage:<10} {node.cases[0]}{more}", rest))

@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+import traceback
 
 # torch's and numba's threads must not spin on shared cores; this has to be said before either is imported
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -72,5 +73,19 @@ def _epilog() -> str:
     return "\n".join(lines)
 
 
+def _leave(status: int) -> None:
+    """Ends the process; at once if Prefect's server was lost, whose client would go on calling it for minutes."""
+    server = sys.modules.get("flows.server")
+    if server and server.lost.is_set():
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
+    sys.exit(status)
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        _leave(main())
+    except Exception:
+        traceback.print_exc()
+        _leave(1)

@@ -100,6 +100,8 @@ REPORT = {
     "note": str,
 }
 LEFT_OUT = {"left_out": int, "left_out_of": list[str] | None}
+RUNNER = {"kind": Literal["threads", "processes", "dask", "ray"], "workers": int}
+CLUSTERS = ("dask", "ray")  # runners that may use workers which run already
 FROM_RUN = {"seed"}  # arguments that come from the top of the config
 OF_STAGES = {
     "clustering",
@@ -166,7 +168,7 @@ def schema(config: dict, sweep: dict[str, object]) -> dict[str, object]:
         "export": {"formats": list[Literal[tuple(EXPORTS)]]},
         "store": {"path": str},
         "memory": {"max_gb": float | None},
-        "runner": {"kind": Literal["threads", "processes"], "workers": int},
+        "runner": RUNNER | ({"address": str | None} if config["runner"].get("kind") in CLUSTERS else {}),
         "sweep": sweep,
     }
 

@@ -1,12 +1,14 @@
-"""A Prefect server of our own for runs that have none to talk to.
+"""The Prefect server that a run talks to: the user's, a running dashboard, or a small one of the run's own.
 
 Prefect starts one by itself, but that one outlives a run that is killed, and several of them share one SQLite file and
-lock each other out. This one keeps its database in memory and ends when the pipe to its parent closes.
+lock each other out. Ours keeps its database in memory and ends when the pipe to its parent closes.
 """
 
 from __future__ import annotations
 
 import contextlib
+import json
+import logging
 import os
 import socket
 import subprocess
@@ -15,6 +17,7 @@ import threading
 import time
 import urllib.request
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 STARTUP_SECONDS = 180  # a slow machine needs more than the usual 20
 
@@ -32,8 +35,9 @@ def quiet_prefect() -> None:
 
 @contextlib.contextmanager
 def server() -> Iterator[Callable[[], str]]:
-    """A function that gives the API's address once it answers: the user's server if one is configured, else one that
-    lives as long as this block and starts while the caller does something else."""
+    """A function that gives the API's address once it answers: the user's server if one is configured, else the
+    dashboard if one runs, else a server that lives as long as this block and starts while the caller does something
+    else."""
     quiet_prefect()
     from prefect.settings import PREFECT_API_URL
 
@@ -41,22 +45,72 @@ def server() -> Iterator[Callable[[], str]]:
     if configured:
         yield lambda: configured
         return
-    port = free_port()
-    url = f"http://127.0.0.1:{port}/api"
-    child = _start(port)
-    log: list[bytes] = []
-    threading.Thread(target=lambda: log.extend(child.stderr), daemon=True).start()
     with contextlib.ExitStack() as settings:
+        dashboard = dashboard_address()
+        if dashboard:
+            _point_at(dashboard, settings)
+            yield lambda: dashboard
+            return
+        port = free_port()
+        url = f"http://127.0.0.1:{port}/api"
+        child = _start(port)
+        log: list[bytes] = []
+        threading.Thread(target=lambda: log.extend(child.stderr), daemon=True).start()
         try:
             yield lambda: _use(url, child, log, settings)
         finally:
-            for name in ("PREFECT_API_URL", "PREFECT_LOGGING_TO_API_ENABLED"):
-                os.environ.pop(name, None)
             child.stdin.close()
             try:
                 child.wait(10)
             except subprocess.TimeoutExpired:
                 child.kill()
+
+
+def watched() -> bool:
+    """Whether the server in use has pages that somebody may look at: ours, which ends with the run, is sent no logs."""
+    from prefect.settings import PREFECT_LOGGING_TO_API_ENABLED
+
+    return PREFECT_LOGGING_TO_API_ENABLED.value()
+
+
+lost = threading.Event()  # set when the server stopped answering in the middle of a run
+_hasty = contextlib.ExitStack()  # settings from then on
+
+
+def alive() -> bool:
+    """Whether the server in use still answers. When it does not, Prefect's client is told to give up at once and to
+    keep quiet, from here on: it would try again for minutes after every stage."""
+    from prefect.settings import PREFECT_API_URL, PREFECT_CLIENT_MAX_RETRIES, temporary_settings
+
+    if lost.is_set():
+        return False
+    for _ in range(3):  # a busy server may be late once
+        if _answers(PREFECT_API_URL.value()):
+            return True
+    lost.set()
+    logging.disable(logging.CRITICAL)
+    _hasty.enter_context(temporary_settings({PREFECT_CLIENT_MAX_RETRIES: 0}))
+    return False
+
+
+def _answers(url: str) -> bool:
+    with contextlib.suppress(OSError, ValueError), urllib.request.urlopen(f"{url}/health", timeout=10) as answer:
+        return answer.read() == b"true"
+    return False
+
+
+def dashboard_note() -> Path:
+    """The file in Prefect's folder in which a running dashboard says where it listens."""
+    return Path(os.environ.get("PREFECT_HOME", "~/.prefect")).expanduser() / "skelebones" / "dashboard.json"
+
+
+def dashboard_address() -> str | None:
+    """The API of the dashboard that runs now; None if there is none, or if it was killed and only its note is left."""
+    try:
+        url = json.loads(dashboard_note().read_text("utf-8"))["api"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return url if _answers(url) else None
 
 
 def _start(port: int) -> subprocess.Popen:
@@ -70,14 +124,21 @@ def _start(port: int) -> subprocess.Popen:
 
 
 def _use(url: str, child: subprocess.Popen, log: list[bytes], settings: contextlib.ExitStack) -> str:
-    """Points Prefect at the server, here and in worker processes. Nobody will read the logs of a server that ends with
-    the run, so they are not sent."""
-    from prefect.settings import PREFECT_API_URL, PREFECT_LOGGING_TO_API_ENABLED, temporary_settings
-
+    """Waits for a server of our own. Nobody will read the logs of one that ends with the run, so they are not sent."""
     _wait(url, child, log)
-    os.environ |= {"PREFECT_API_URL": url, "PREFECT_LOGGING_TO_API_ENABLED": "false"}
-    settings.enter_context(temporary_settings({PREFECT_API_URL: url, PREFECT_LOGGING_TO_API_ENABLED: False}))
+    _point_at(url, settings, PREFECT_LOGGING_TO_API_ENABLED="false")
     return url
+
+
+def _point_at(url: str, settings: contextlib.ExitStack, **more: str) -> None:
+    """Points Prefect at a server, here and in worker processes, until the settings are closed."""
+    from prefect import settings as known
+    from prefect.settings import temporary_settings
+
+    changed = {"PREFECT_API_URL": url, **more}
+    os.environ.update(changed)
+    settings.callback(lambda: [os.environ.pop(name, None) for name in changed])
+    settings.enter_context(temporary_settings({getattr(known, name): value for name, value in changed.items()}))
 
 
 def free_port() -> int:
@@ -92,9 +153,8 @@ def _wait(url: str, child: subprocess.Popen, log: list[bytes]) -> None:
     while time.monotonic() < end:
         if child.poll() is not None:
             raise RuntimeError(f"Prefect's server did not start:\n{b''.join(log).decode(errors='replace')[-2000:]}")
-        with contextlib.suppress(OSError), urllib.request.urlopen(f"{url}/health", timeout=5) as answer:
-            if answer.status == 200:
-                return
+        if _answers(url):
+            return
         time.sleep(0.1)
     raise TimeoutError(f"Prefect's server did not answer within {STARTUP_SECONDS} s")
 

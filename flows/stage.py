@@ -13,6 +13,7 @@ import json
 import shutil
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import cache, partial
 from importlib.metadata import version
@@ -47,6 +48,10 @@ class Job:
     max_gb: float | None = None
 
 
+def _silent(text: str, fraction: float) -> None:
+    """Nobody listens."""
+
+
 def key_of(job: Job) -> str:
     """The cache key of a job."""
     settings = {n: _canonical(v) for n, v in job.settings.items()}
@@ -66,8 +71,11 @@ def key_of(job: Job) -> str:
     return hashlib.sha256(canonical_json(content).encode()).hexdigest()[:32]
 
 
-def run(job: Job) -> Ref:
-    """The job's artefact, from the store or computed now. Any process may call it; equal jobs wait for one another."""
+def run(job: Job, say: Callable[[str, float], None] = _silent) -> Ref:
+    """The job's artefact, from the store or computed now. Any process may call it; equal jobs wait for one another.
+
+    say: hears how far a long stage is, a text and a share of the whole.
+    """
     store, key = Store(job.store), key_of(job)
     found = store.find(job.stage, key)
     if found:
@@ -78,7 +86,7 @@ def run(job: Job) -> Ref:
             return found
         tell(job, "computing")
         with Watch() as watch:
-            values = _compute(job, store, key)
+            values = _compute(job, store, key, say)
         meta = {
             "function": job.function,
             "settings": job.settings,
@@ -139,7 +147,7 @@ def one_blas_thread() -> None:
     threadpool_limits(1, user_api="blas")
 
 
-def _compute(job: Job, store: Store, key: str) -> dict[str, object]:
+def _compute(job: Job, store: Store, key: str, say: Callable[[str, float], None]) -> dict[str, object]:
     one_blas_thread()
     module, name = job.function.split(":")
     function = getattr(importlib.import_module(module), name)
@@ -149,14 +157,15 @@ def _compute(job: Job, store: Store, key: str) -> dict[str, object]:
         folder = store.scratch(job.stage, key)
         with explained(folder):
             folder.mkdir(parents=True, exist_ok=True)
-        inputs[WORKSPACE] = Workspace(folder, partial(_progress, job), job.max_gb)
+        inputs[WORKSPACE] = Workspace(folder, partial(_progress, job, say), job.max_gb)
     result = function(**inputs, **job.settings)
     values = result if isinstance(result, tuple) else (result,)
     return dict(zip(job.outputs, values, strict=True))
 
 
-def _progress(job: Job, text: str, fraction: float) -> None:
+def _progress(job: Job, say: Callable[[str, float], None], text: str, fraction: float) -> None:
     tell(job, "progress", text=text, fraction=fraction)
+    say(text, fraction)
 
 
 def _load(store: Store, value: object, kind: str) -> object:

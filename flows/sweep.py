@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import shlex
 import tempfile
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from flows.artifacts import Board
 from flows.batch import Batch, Work, work
 from flows.config import Missing
 from flows.graph import Graph, Node, short
 from flows.progress import Progress
-from flows.server import server
+from flows.runners import task_runner
+from flows.server import lost, server
 from flows.stage import Job, run
 from flows.store import CorruptArtefact, Ref, Store
 from tasks.errors import InputError
@@ -47,40 +50,50 @@ def run_batch(batch: Batch, show: bool = True) -> Path:
         graph, works = work(batch.experiments, config["report"])
         ready()
         cases = sum(len(experiment.cases) for experiment in batch.experiments)
-        return Path(_flow(batch, graph, works, show)(config["report"]["name"], cases))
+        flow, written = _flow(batch, graph, works, show)
+        try:
+            flow(config["report"]["name"], cases)
+        except Exception:
+            if not (written and lost.is_set()):  # else only the end of the run could not be told to the server
+                raise
+        return written[0]
 
 
 def _flow(batch: Batch, graph: Graph, works: list[Work], show: bool):
-    """The flow of a sweep; its parameters are what the run's page shows."""
+    """The flow of a sweep, its parameters are what the run's page shows; and where the report's place will be."""
     from prefect import flow
 
     config = batch.config
+    written: list[Path] = []
 
     @flow(name=config["report"]["name"], task_runner=task_runner(config["runner"]), validate_parameters=False)
-    def sweep(experiment: str, cases: int) -> str:
-        from flows.artifacts import ProgressArtifact, publish
+    def sweep(experiment: str, cases: int) -> None:
         from flows.reporting import write_index
 
-        bar = ProgressArtifact(experiment, len(graph.nodes))
-        with Progress(graph, show, bar.update) as progress:
+        progress = Progress(graph, show)  # made here, since Prefect pickles the flow's closure for worker processes
+        board = Board(experiment, graph, progress.note)
+        progress.tell = board.update
+        board.start()
+        with progress:
             for what, why in (pair for experiment in batch.experiments for pair in experiment.not_run):
                 progress.note(f"not run: {what}, {why}")
-            outcome, reports = _computed_reports(batch, graph, works, progress)
+            outcome, reports = _computed_reports(batch, graph, works, progress, board)
         for report in [r for r in reports if r.folder]:
-            publish(report.folder, report.markdown)
+            board.publish(report.folder, report.markdown)
         if batch.index:
             place = write_index(batch, reports)
             progress.finish([report.line for report in reports], place, len(outcome.computed))
             raise_first(graph, outcome, pardoned=InputError)
-            return str(place)
+            written.append(place)
+            return
         progress.finish(reports[0].shown, reports[0].folder, len(outcome.computed))
-        return str(reports[0].folder)
+        written.append(reports[0].folder)
 
-    return sweep
+    return sweep, written
 
 
 def _computed_reports(
-    batch: Batch, graph: Graph, works: list[Work], progress: Progress
+    batch: Batch, graph: Graph, works: list[Work], progress: Progress, board: Board
 ) -> tuple[Outcome, list[Report]]:
     """The reports that could be written, and what became of the stages."""
     store = Store(batch.config["store"]["path"])
@@ -88,6 +101,10 @@ def _computed_reports(
     for attempt in range(1, ATTEMPTS + 1):
         outcome = compute(graph, batch.config, progress)
         outcome.computed |= computed
+        for node in failed(graph, outcome):
+            command = _command(node, works)
+            board.failure(node.title, node.cases, outcome.errors[node.id], command)
+            progress.note(f"run it alone: {command}")
         if not batch.index:
             raise_first(graph, outcome)
         try:
@@ -127,6 +144,13 @@ def _written(works: list[Work], outcome: Outcome, store: Store) -> list[Report]:
     return reports
 
 
+def _command(node: Node, works: list[Work]) -> str:
+    """The command that runs one case of a node by itself."""
+    planned = next(one.planned for one in works if node.id in one.graph.nodes)
+    case = next((p.case for p in planned if {p.name, p.case.data} & set(node.cases)), planned[0].case)
+    return shlex.join(["python", "-m", "flows.run", *case.alone])
+
+
 def compute(graph: Graph, config: dict, progress: Progress) -> Outcome:
     """Brings every node of the graph to the store; damaged artefacts that come to light are computed again."""
     outcome = Outcome()
@@ -159,7 +183,7 @@ def _pass(graph: Graph, config: dict, progress: Progress, outcome: Outcome) -> N
             for node in [n for n in waiting if all(u.id in outcome.refs for u in n.upstream())]:
                 waiting.remove(node)
                 job = job_of(node, outcome.refs, config, events)
-                named = task.with_options(name=node.stage, task_run_name=f"{node.stage} · {short(node.cases)}")
+                named = task.with_options(name=node.stage, task_run_name=f"{node.title}: {short(node.cases)}")
                 future = named.submit(job, wait_for=[futures[u.id] for u in node.upstream() if u.id in futures])
                 running[future] = node
                 futures[node.id] = future
@@ -192,7 +216,9 @@ def stage_task():
 
     @task(persist_result=False, retries=0)
     def stage(job: Job):
-        ref = run(job)
+        from flows.artifacts import StageBar
+
+        ref = run(job, StageBar(job.stage, job.case).say)
         if ref.cached:
             return Completed(name="Cached", message="taken from the store", data=ref_to_dict(ref))
         return ref_to_dict(ref)
@@ -200,28 +226,21 @@ def stage_task():
     return stage
 
 
+def failed(graph: Graph, outcome: Outcome) -> list[Node]:
+    """The stages that failed themselves, in the order of the graph."""
+    return [n for n in graph.nodes.values() if n.id in outcome.errors]
+
+
 def raise_first(graph: Graph, outcome: Outcome, pardoned: type[Exception] | tuple = ()) -> None:
-    """Raises the first error of a stage that failed itself, in the order of the graph, but none of the pardoned."""
-    failed = [n for n in graph.nodes.values() if n.id in outcome.errors]
-    failed = [n for n in failed if not isinstance(outcome.errors[n.id], pardoned)]
-    if not failed:
+    """Raises the first error of a stage that failed itself, but none of the pardoned."""
+    nodes = [n for n in failed(graph, outcome) if not isinstance(outcome.errors[n.id], pardoned)]
+    if not nodes:
         return
-    node, error = failed[0], outcome.errors[failed[0].id]
+    node, error = nodes[0], outcome.errors[nodes[0].id]
     if isinstance(error, InputError):
         raise error
-    more = f" ({len(failed) - 1} more stages failed)" if len(failed) > 1 else ""
-    raise StageFailed(f"stage {node.stage} failed for {short(node.cases)}{more}: {error!r}") from error
-
-
-def task_runner(settings: dict):
-    """Prefect's own task runner of the kind that the config names."""
-    from prefect.task_runners import ProcessPoolTaskRunner, ThreadPoolTaskRunner
-
-    workers = settings["workers"]
-    if workers < 1:
-        raise InputError("runner.workers", expected="at least 1", found=str(workers))
-    kinds = {"threads": ThreadPoolTaskRunner, "processes": ProcessPoolTaskRunner}
-    return kinds[settings["kind"]](max_workers=workers)
+    more = f" ({len(nodes) - 1} more stages failed)" if len(nodes) > 1 else ""
+    raise StageFailed(f"stage {node.title} failed for {short(node.cases)}{more}: {error!r}") from error
 
 
 def job_of(node: Node, refs: dict[str, Ref], config: dict, events: str | None) -> Job:
@@ -243,7 +262,7 @@ def job_of(node: Node, refs: dict[str, Ref], config: dict, events: str | None) -
         source=node.source,
         files=node.files,
         case=short(node.cases),
-        store=config["store"]["path"],
+        store=str(Path(config["store"]["path"]).absolute()),  # a worker may stand in another folder
         events=events,
         max_gb=config["memory"]["max_gb"],
     )

@@ -23,10 +23,18 @@ def shared_data() -> Path:
 
 
 @pytest.fixture(scope="session")
-def prefect_server():
+def prefect_home(tmp_path_factory) -> Path:
+    """Prefect's folder for the whole test run: never the user's, nor a dashboard that runs beside the tests."""
+    folder = tmp_path_factory.mktemp("prefect")
+    os.environ["PREFECT_HOME"] = str(folder)
+    os.environ.pop("PREFECT_API_URL", None)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def prefect_server(prefect_home):
     """One Prefect server for the whole test run."""
     from flows.server import server
 
-    os.environ.pop("PREFECT_API_URL", None)  # never the user's
     with server() as ready:
         yield ready()

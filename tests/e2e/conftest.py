@@ -51,6 +51,15 @@ def worm_file(tmp_path_factory) -> Path:
     return path
 
 
+@pytest.fixture(scope="session")
+def small_file(tmp_path_factory) -> Path:
+    """The same, as small as the stages take it, for tests that run it often."""
+    points, faces = worm(frames=30, around=8, along=24)
+    path = tmp_path_factory.mktemp("data") / "small.npz"
+    np.savez(path, vertices=points, faces=faces)
+    return path
+
+
 class Run:
     """Runs the command in a folder of its own, with its own store and reports."""
 

@@ -145,6 +145,35 @@ def test_braces_name_several_files_and_absent_ones_can_be_done_without(tmp_path)
     assert [c.absent for c in config.expand([*file, "sweep.absent=skip"])] == [False, True, True, True]
 
 
+@pytest.mark.parametrize(
+    ("overrides", "multirun"),
+    [
+        (["+experiment=ablation_bones"], False),
+        (["method=partmm", "bones.max_bones=10,20", "animate.k=1,3"], True),
+        (["sweep.datasets=null", "sweep.methods=null", "+ablation=k_1", "seed=4"], False),
+        (["+experiment=ablation_matching", "sweep.ablations=null", "report.name=mine"], False),
+        (["sweep.datasets=null", "sweep.methods=[lbs,mlp]", "sweep.seeds=[3,4]"], False),
+        (["animate.k=3"], False),
+    ],
+    ids=str,
+)
+def test_a_case_can_be_run_alone_by_its_own_overrides(overrides, multirun):
+    for case in config.expand(overrides, multirun):
+        (alone,) = config.expand(list(case.alone))
+        assert {**alone.config, "sweep": 0, "report": 0} == {**case.config, "sweep": 0, "report": 0}
+        assert alone.config["report"]["name"] == config.ALONE
+
+
+def test_a_file_of_many_can_be_run_alone(tmp_path):
+    for name in ("b one's.npz", "a.npz"):
+        (tmp_path / name).write_bytes(b"")
+    cases = config.expand(["+experiment=table3", "dataset=mesh_sequence", f"dataset.path='{tmp_path}/*.npz'"])
+    assert len({c.data for c in cases}) == 2
+    for case in cases:
+        (alone,) = config.expand(list(case.alone))
+        assert alone.config["dataset"] == case.config["dataset"]
+
+
 def test_a_whole_number_may_stand_for_a_number_and_nothing_else_is_converted():
     expected = {"a": float, "b": int | None, "c": list[str]}
     assert schema.check({"a": 1, "b": None, "c": []}, expected) == {"a": 1.0, "b": None, "c": []}

@@ -10,9 +10,10 @@ import pytest
 from flows import source
 from flows.graph import Graph, short
 from flows.progress import Progress
+from flows.runners import task_runner
 from flows.stage import Job, key_of, run
 from flows.store import CorruptArtefact, Store
-from flows.sweep import StageFailed, compute, raise_first, task_runner
+from flows.sweep import StageFailed, compute, raise_first
 from tasks.errors import InputError
 from tasks.workspace import Workspace
 

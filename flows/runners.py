@@ -1,0 +1,57 @@
+"""Where stages run: Prefect's own task runners, by the name that the config gives them."""
+
+from __future__ import annotations
+
+import importlib
+import os
+
+from tasks.errors import InputError
+
+
+def task_runner(settings: dict):
+    """The task runner of a config's ``runner`` group. Raises InputError if its package is absent."""
+    workers = settings["workers"]
+    if workers < 1:
+        raise InputError("runner.workers", expected="at least 1", found=str(workers))
+    return {"threads": _threads, "processes": _processes, "dask": _dask, "ray": _ray}[settings["kind"]](settings)
+
+
+def _threads(settings: dict):
+    from prefect.task_runners import ThreadPoolTaskRunner
+
+    return ThreadPoolTaskRunner(max_workers=settings["workers"])
+
+
+def _processes(settings: dict):
+    from prefect.task_runners import ProcessPoolTaskRunner
+
+    return ProcessPoolTaskRunner(max_workers=settings["workers"])
+
+
+def _dask(settings: dict):
+    """A running scheduler's workers, or new processes with one stage at a time each."""
+    runner = _extra("prefect_dask", "dask").DaskTaskRunner
+    if settings["address"]:
+        return runner(address=settings["address"])
+    own = {"n_workers": settings["workers"], "threads_per_worker": 1, "processes": True, "dashboard_address": None}
+    return runner(cluster_kwargs=own)
+
+
+def _ray(settings: dict):
+    """A running cluster's workers, or new processes with one stage at a time each."""
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    runner = _extra("prefect_ray", "ray").RayTaskRunner
+    if settings["address"]:
+        return runner(address=settings["address"])
+    return runner(init_kwargs={"num_cpus": settings["workers"], "include_dashboard": False, "log_to_driver": False})
+
+
+def _extra(package: str, extra: str):
+    try:
+        return importlib.import_module(package)
+    except ModuleNotFoundError as error:
+        if error.name != package:
+            raise
+        found = f"no package {package.replace('_', '-')}"
+        do = f'pip install -c constraints.txt -e ".[{extra}]"'
+        raise InputError("runner.kind", expected=f"what {extra} needs", found=found, do=do) from None

@@ -1,7 +1,8 @@
 """``python -m flows.report A B``: what two reports differ in: numbers, configs, code, data, machine.
 
 ``python -m flows.report --render A`` writes a report's tables anew from its metrics.csv, after a change of how tables
-look. Exit status: 0 done, 2 a folder that holds no report.
+look; ``--index reports`` writes index.html for all reports that lie in a folder. Exit status: 0 done, 2 a folder that
+holds no report.
 """
 
 from __future__ import annotations
@@ -62,14 +63,21 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m flows.report", description="Compares two reports.")
     parser.add_argument("reports", nargs="+", type=Path, metavar="FOLDER", help="reports/A reports/B")
     parser.add_argument("--render", action="store_true", help="write the tables of each report anew instead")
+    parser.add_argument("--index", action="store_true", help="write index.html for a folder of reports instead")
     parser.add_argument("--tolerance", type=float, help=f"relative (default: 0 on one machine, else {TOLERANCE:g})")
     known = parser.parse_args(arguments)
     try:
         if known.render:
-            from flows.reporting import render_again
+            from flows.shelf import render_again
 
             for folder in known.reports:
                 print(f"{folder}: {render_again(folder)} files changed")
+            return 0
+        if known.index:
+            from flows.shelf import index_folder
+
+            for folder in known.reports:
+                print(index_folder(folder))
             return 0
         if len(known.reports) != 2:
             parser.error("two reports are compared")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,14 +11,14 @@ from omegaconf import OmegaConf
 
 from flows.config import CONF, NO_ABLATION, Case
 from flows.pipeline import Planned
-from flows.provenance import command, provenance
+from flows.provenance import provenance
 from flows.store import Ref, Store
-from tasks.errors import InputError
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from flows.batch import Batch, Experiment, Work
+    from flows.batch import Experiment, Work
+    from tasks.evaluation.paper import Paper
     from tasks.evaluation.tables import Table
     from tasks.values import Picture
 
@@ -120,65 +120,10 @@ def write(work: Work, refs: dict[str, Ref], computed: set[str], store: Store) ->
     figures += _charts(rows, labels_of(cases))
     folder = Path(settings["path"]).expanduser() / settings["name"]
     origin = provenance(work.experiment.arguments, cases, work.graph, refs, computed)
-    origin |= {"remarks": remarks, "said": said}
+    origin |= {"remarks": remarks, "said": said, "missing": [asdict(one) for one in work.experiment.missing]}
     brought = [store.load(refs[node.id], output) for node, output in work.files]
     report.write_report(folder, rows, tables, figures, origin, brought)
     return Report(work.experiment, folder, rows, tables, figures, cases, origin)
-
-
-def made_again(folder: Path) -> dict[str, bytes]:
-    """The files of a report but its provenance, made anew from its metrics.csv, provenance.json and figures.
-
-    Raises InputError where one of them cannot be read.
-    """
-    from tasks.evaluation import report
-    from tasks.evaluation.rows import from_csv
-
-    origin = report.read_provenance(folder)
-    if "said" not in origin:
-        do = f"run it again: {' '.join(origin.get('command', []))}"
-        raise InputError(str(folder), expected="a report of this version", found="an older one", do=do)
-    rows = from_csv((folder / "metrics.csv").read_text("utf-8"), str(folder / "metrics.csv"))
-    tables = tables_of([Case(**case) for case in origin["cases"]], rows, origin["remarks"], origin["said"])
-    return report.contents(folder.name, rows, tables, report.read_figures(folder, origin), origin)
-
-
-def render_again(folder: Path) -> int:
-    """Writes the files of :func:`made_again` over a report's own; returns how many changed."""
-    from tasks.evaluation import report
-
-    return report.replace_files(folder, made_again(folder))
-
-
-def write_index(batch: Batch, reports: list[Report]) -> Path:
-    """Writes the page that holds all experiments of a run, beside their folders. Returns its path."""
-    from tasks.evaluation import coverage, index, report
-
-    by_name = {r.experiment.name: r for r in reports}
-    every = [by_name.get(e.name, Report(e)) for e in batch.experiments]
-    paper = _paper()
-    measured = [
-        coverage.Measured(r.cases[0].config["report"]["paper_table"], r.rows, *_places(r.cases, r.rows))
-        for r in every
-        if r.folder and r.cases[0].config["report"]["paper_table"]
-    ]
-    absent = {m.stands_for: m.why for r in every for m in r.experiment.missing if m.stands_for}
-    sections = [
-        index.Section(
-            name=r.experiment.name,
-            title=r.experiment.title,
-            command=command(r.experiment.arguments),
-            tables=r.tables,
-            figures=[picture for _, picture in r.figures],
-            missing=r.experiment.not_run,
-        )
-        for r in every
-    ]
-    folder = Path(batch.config["report"]["path"]).expanduser()
-    origin = next((r.provenance for r in every if r.folder), {})
-    page = index.html(batch.config["report"]["title"], sections, coverage.cover(paper, measured, absent), origin)
-    report.write_page(folder / "index.html", page)
-    return folder / "index.html"
 
 
 def _rows(case: Planned, refs: dict[str, Ref], store: Store):
@@ -203,8 +148,8 @@ def tables_of(cases: list[Case], rows, remarks: list[str], said: list[str]) -> l
     from tasks.evaluation.rows import with_means
     from tasks.evaluation.tables import build, unranked
 
-    paper, settings = _paper(), cases[0].config["report"]
-    data_status, stands_for = _places(cases, rows)
+    paper, settings = paper_numbers(), cases[0].config["report"]
+    data_status, stands_for = places(cases, rows)
     # bones and skeleton do not depend on the method, and seldom on the variant: one row for each that differs
     lead = rows[rows["method"] == cases[-1].method].drop_duplicates(["dataset", "subject", "metric", "key", "seed"])
     common = {
@@ -290,13 +235,14 @@ def _gain_tables(rows, settings: dict, paper, common: dict) -> list:
     return tables
 
 
-def _paper():
+def paper_numbers() -> Paper:
+    """What the paper prints."""
     from tasks.evaluation.paper import paper_of
 
     return paper_of(OmegaConf.to_container(OmegaConf.load(CONF / "paper" / "gaussianimate.yaml")))
 
 
-def _places(cases: list[Case], rows) -> tuple[dict[str, str], dict[str, str]]:
+def places(cases: list[Case], rows) -> tuple[dict[str, str], dict[str, str]]:
     """By dataset, whether it is the paper's; by dataset and subject, the paper's column that it stands for."""
     datasets = {c.dataset: c.config["dataset"] for c in cases}
     stands_for = {
@@ -369,7 +315,7 @@ def _charts(rows, labels: dict[str, str]) -> list:
 
     drawn = []
     for method in dict.fromkeys(rows["method"]):
-        variants = rows.loc[rows["method"] == method, "variant"]
+        variants = rows.loc[(rows["method"] == method) & (rows["metric"] == "rmse"), "variant"]
         if variants.eq("").any() and variants.ne("").any():
             chart = ablation_chart(rows, metric="rmse", method=method, labels=labels)
             caption = f"{labels[method]}: change of the RMSE on unseen clips by each variant"

@@ -68,7 +68,7 @@ def _flow(batch: Batch, graph: Graph, works: list[Work], show: bool):
 
     @flow(name=config["report"]["name"], task_runner=task_runner(config["runner"]), validate_parameters=False)
     def sweep(experiment: str, cases: int) -> None:
-        from flows.reporting import write_index
+        from flows.shelf import index_batch
 
         progress = Progress(graph, show)  # made here, since Prefect pickles the flow's closure for worker processes
         board = Board(experiment, graph, progress.note)
@@ -81,7 +81,7 @@ def _flow(batch: Batch, graph: Graph, works: list[Work], show: bool):
         for report in [r for r in reports if r.folder]:
             board.publish(report.folder, report.markdown)
         if batch.index:
-            place = write_index(batch, reports)
+            place = index_batch(batch, reports)
             progress.finish([report.line for report in reports], place, len(outcome.computed))
             raise_first(graph, outcome, pardoned=InputError)
             written.append(place)

@@ -17,7 +17,7 @@ from markupsafe import Markup
 from tasks.evaluation import page, typeset
 from tasks.evaluation.coverage import Covered
 from tasks.evaluation.metrics import metric_of
-from tasks.evaluation.tables import Table, digits_for
+from tasks.evaluation.tables import Table, digits_for, printed_digits
 from tasks.values import Picture
 
 WIDEST = 1280  # pixels of a picture on the page; the report's folder has it whole
@@ -41,7 +41,8 @@ pre { background: var(--card); border-radius: 8px; padding: .55rem .8rem; margin
 .coverage tr.group small { display: block; color: var(--soft); font-weight: 400 }
 .badge.reproduced { color: var(--real) }
 .badge.not { color: var(--soft) }
-.gallery { display: grid; gap: 1rem; grid-template-columns: repeat(auto-fit, minmax(min(100%, 30rem), 1fr)) }
+.gallery { display: grid; gap: 1rem; align-items: start;
+  grid-template-columns: repeat(auto-fit, minmax(min(100%, 30rem), 1fr)) }
 .gallery figure { margin: 0 }
 .picture { min-width: 0 }
 .picture .pan { overflow-x: auto }
@@ -203,7 +204,8 @@ def _table(number: int, cells: Sequence[Covered]) -> tuple[int, list, bool, str]
         digits = digits_for([c.ours for c in members if c.ours is not None], metric)
         label, unit = metric_of(metric).label, members[0].unit
         heading = f"{column}, {label}" + ("" if unit in ("ratio", "count", "unit") else f" [{unit}]")
-        groups.append((heading, _reasons(members), [_cell(c, digits) for c in members]))
+        printed = printed_digits([c.paper for c in members if c.paper is not None])
+        groups.append((heading, _reasons(members), [_cell(c, digits, printed) for c in members]))
     return number, groups, any(c.ours is not None for c in cells), _counts(cells)
 
 
@@ -216,11 +218,11 @@ def _reasons(cells: Sequence[Covered]) -> list[str]:
     return [f"{', '.join(names) if len(names) < len(cells) else 'not run'}: {why}" for why, names in whys.items()]
 
 
-def _cell(cell: Covered, digits: int) -> dict[str, str]:
+def _cell(cell: Covered, digits: int, printed: int) -> dict[str, str]:
     gap = None if cell.paper is None or cell.ours is None else cell.ours - cell.paper
     return {
         "method": cell.method,
-        "paper": "?" if cell.paper is None else f"{cell.paper:g}",
+        "paper": "?" if cell.paper is None else typeset.number(cell.paper, printed),
         "ours": "–" if cell.ours is None else typeset.number(cell.ours, digits),
         "difference": "–" if gap is None else typeset.number(gap, digits, signed=True),
         "status": cell.status,

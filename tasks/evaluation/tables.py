@@ -227,7 +227,7 @@ def _column(group: str, metric: str, kind: str, status: str, cells: list[tuple[C
     if len(units) != 1:
         raise ValueError(f"{group} {metric}: one unit a column, got {sorted(units)}")
     known = [v for v in values if v is not None]
-    digits = _printed_digits(known) if kind == "paper" else digits_for(known, metric)
+    digits = printed_digits(known) if kind == "paper" else digits_for(known, metric)
     return Column(group, metric, units.pop(), kind, status, digits, tuple(cell for cell, _ in cells))
 
 
@@ -240,7 +240,7 @@ def _ranked(column: Column, names: list[Row], bounds: Sequence[str]) -> Column:
     return replace(column, cells=tuple(replace(c, rank=r) for c, r in zip(column.cells, marks, strict=True)))
 
 
-def _printed_digits(values: Sequence[float]) -> int:
+def printed_digits(values: Sequence[float]) -> int:
     """As many decimals as the paper prints in the column."""
     return max((len(repr(v).partition(".")[2].rstrip("0")) for v in values), default=0)
 

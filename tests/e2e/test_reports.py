@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from flows.reporting import made_again
+from flows.shelf import made_again
 from tests.e2e.conftest import Run
 from tests.e2e.test_user import table3
 

@@ -61,7 +61,7 @@ def unseen_views(config: dict, add, nodes: Nodes) -> list[Node]:
     """The metrics of the posed Gaussians, rendered where cameras see the unseen frames; none without such cameras."""
     if "unseen_views" not in nodes:
         return []
-    inputs = {n: nodes[n] for n in ("reconstruction", "animation", "skinning")} | {"motion": nodes["test"]}
+    inputs = {n: nodes[n] for n in ("reconstruction", "animation")}
     posed = add("pose", schema.POSE_GAUSSIANS, {}, "reconstruction", **inputs)["reconstruction"]
     nodes["posed"] = posed
     return [_compare(config, add, nodes, posed, nodes["unseen_views"])]

@@ -62,6 +62,9 @@ def plan(case: Case, graph: Graph) -> Planned:
         unseen = {n: nodes[n] for n in ("animation", "test", "canonical")}
         metrics.append(add("evaluate", schema.EVALUATE, config["evaluate"], "metrics", **unseen))
         metrics += intake.unseen_views(config, add, nodes)
+        nodes |= _confidence(config, add, nodes)
+        seen = {n: nodes[n] for n in ("confidence", "animation", "test")}
+        metrics.append(add("evaluate", schema.EVALUATE_CONFIDENCE, {}, "metrics", **seen))
         metrics += _left_out(case, add, nodes)
     return Planned(case, name, tuple(metrics), nodes)
 
@@ -134,6 +137,14 @@ def _answer(config: dict, add, nodes: dict[str, Output], motion: Output, query: 
     return add("animate", method, config["animate"], "animation", **inputs)["animation"]
 
 
+def _confidence(config: dict, add, nodes: dict[str, Output]) -> dict[str, Output]:
+    """How far the unseen poses lie from the database."""
+    inputs = {"training": _training(nodes, nodes["train"]), "query": nodes["query"]}
+    return {
+        "confidence": add("confidence", schema.CONFIDENCE, config["confidence"], "confidence", **inputs)["confidence"]
+    }
+
+
 def _left_out(case: Case, add, nodes: dict[str, Output]) -> list[Node]:
     """The method again without one training clip, in turn: on the unseen clips and on the one left out."""
     config = case.config
@@ -183,10 +194,24 @@ def plan_files(planned: list[Planned], graph: Graph) -> list[Output]:
     character = ("skinning", "reconstruction")
     found = [output for p in planned if any(n in p.nodes for n in character) for output in _exports(p, graph)]
     found += [p.nodes["scene_files"] for p in planned if "scene_files" in p.nodes]
+    found += _sources(planned, graph)
     made = {p.case.config["dataset"]["garment"]: p for p in planned if "garment_file" in p.nodes}
     if made:
         every = next(iter(made.values())).case.config["make"]["every"]
         found += plan_manifest({garment: p.nodes for garment, p in made.items()}, every, graph)
+    return found
+
+
+def _sources(planned: list[Planned], graph: Graph) -> list[Output]:
+    """For every dataset, which training frames its unseen ones resemble, part by part, by the last method's parts."""
+    lead = {p.case.data: p for p in planned if "confidence" in p.nodes and p.case.variant == NO_ABLATION}
+    found = []
+    for data, case in lead.items():
+        inputs = {n: case.nodes[n] for n in ("confidence", "test", "train")}
+        name = re.sub(r"[^A-Za-z0-9.-]+", "_", data)
+        function = "tasks.evaluation.confidence:confidence_file"
+        node = graph.add("confidence", function, {"name": name}, outputs=("files",), case=data, **inputs)
+        found.append(node["files"])
     return found
 
 
@@ -290,5 +315,12 @@ def _pictures(shown: list[Planned], graph: Graph) -> list[Node]:
         labels = _labels(shown)
         animations = {label: p.nodes["animation"] for label, p in zip(labels, shown, strict=True)}
         errors = add("error_picture", "test canonical", {"focus": labels[-1]}, animations=animations)
+        pictures.append(_confidence_picture(lead, animations, graph))
         pictures.insert(0, errors)
     return pictures
+
+
+def _confidence_picture(lead: Planned, animations: dict[str, Output], graph: Graph) -> Node:
+    function = "tasks.evaluation.confidence:confidence_picture"
+    inputs = {n: lead.nodes[n] for n in ("confidence", "test")} | {"animations": animations}
+    return graph.add("figures", function, {}, outputs=("picture",), case=lead.case.data, **inputs)

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 UNSEEN = ("rmse_pct", "rmse", "rmse_coordinate")
 MOTION = ("velocity_rmse", "speed_ratio", "max_error")
+CONFIDENCE = ("confidence_spearman", "outside_pct")
 LEFT_OUT = ("rmse_spread", "rmse_left_out", "rmse_left_out_spread")
 VIEWS = ("psnr", "ssim", "flip", "lpips", "ssim_down")
 PATHS = ("path_pct", "path_start_pct")
@@ -179,6 +180,13 @@ def tables_of(cases: list[Case], rows, remarks: list[str], said: list[str]) -> l
         tables.append(build(rows, title=title, metrics=UNSEEN, notes=notes, **printed, **common))
         tables += _gain_tables(rows, settings, paper, common)
         tables.append(build(rows, title="Motion of the same results", metrics=MOTION, notes=[], **common))
+    if rows["metric"].isin(CONFIDENCE).any():
+        note = (
+            "Expected from a pose's distance to the database alone, calibrated by leaving training clips out: how well "
+        )
+        note += "it ranks the frames by the error that each row makes there. Outside: farther off than 95 % of those."
+        plain = common | {"baselines": []}
+        tables.append(build(rows, title="Confidence", metrics=CONFIDENCE, notes=[note], **plain))
     if rows["metric"].isin(LEFT_OUT).any():
         runs = cases[0].config["evaluate"]["left_out"]
         note = f"Trained {runs} times, each time without one training clip: how far that moves the error on the unseen "

@@ -48,6 +48,8 @@ EVALUATE_PATHS = "tasks.evaluation.paths:evaluate_paths"
 EVALUATE = "tasks.evaluation.metrics:evaluate"
 EVALUATE_RIG = "tasks.evaluation.rig:evaluate_rig"
 MATCHING = "tasks.methods.partmm:animate"
+CONFIDENCE = "tasks.motion.confidence:confidence"
+EVALUATE_CONFIDENCE = "tasks.evaluation.confidence:evaluate_confidence"
 FLOOR = "tasks.bones.refit:compression_floor"
 LEAVE_OUT = "tasks.motion.left_out:leave_out"
 EVALUATE_LEFT_OUT = "tasks.evaluation.left_out:evaluate_left_out"
@@ -150,6 +152,7 @@ def schema(config: dict, sweep: dict[str, object]) -> dict[str, object]:
         "seed": int,
         "plan": bool,
         "method_seed": int | None,
+        "confidence": settings(CONFIDENCE),
         "data_root": str,
         "pipeline": Literal[PIPELINES],
         "dataset": {

@@ -283,6 +283,20 @@ class Animation:
 
 
 @dataclass(frozen=True)
+class Confidence:
+    """How far unseen poses lie from the database. windows: (F, P, K) int32 the training frame that each of a part's
+    nearest windows has in the place of the frame; distance: (F, P, K) mean angle to them in radians; expected: (F,)
+    error to be expected of matching, in the data's unit, 0 where one clip leaves nothing to judge by; outside: (F,)
+    share of training frames that lie nearer to the other clips: near 1 is outside the database; parts: P names."""
+
+    windows: np.ndarray
+    distance: np.ndarray
+    expected: np.ndarray
+    outside: np.ndarray
+    parts: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class Metrics:
     """Numbers of one case. names: metric names, units: theirs, values: (K,) float64."""
 
@@ -368,7 +382,9 @@ class Training:
 
 _IMAGES = (Capture, Gaussians, Reconstruction)
 _KINDS = (Rig, Motion, Canonical, Clusters, Skinning, Surface, Curve, Skeleton, Poses, Parts, Database, Training)
-VALUES = {kind.__name__: kind for kind in (*_KINDS, *_IMAGES, Animation, Metrics, About, Picture, Cloth, Files)}
+VALUES = {
+    kind.__name__: kind for kind in (*_KINDS, *_IMAGES, Animation, Confidence, Metrics, About, Picture, Cloth, Files)
+}
 
 
 def same(a: object, b: object) -> bool:

@@ -37,6 +37,16 @@ METRICS: dict[str, Metric] = {
     "rmse": Metric("RMSE", "length", "lower", "vertex RMSE on unseen clips, sqrt(sum |d|^2 / (F N))"),
     "rmse_pct": Metric("RMSE", "percent", "lower", "the same in % of the canonical bounding box's diagonal", 2),
     "rmse_coordinate": Metric("RMSE per coordinate", "length", "lower", "sqrt(sum |d|^2 / (3 F N))"),
+    "confidence_spearman": Metric(
+        "confidence",
+        "ratio",
+        "higher",
+        "rank correlation of the expected error with the true one, over unseen frames",
+        2,
+    ),
+    "outside_pct": Metric(
+        "outside", "percent", "none", "unseen frames farther off than 95 % of left-out training ones", 1
+    ),
     "rmse_spread": Metric("± clip left out", "length", "none", "standard deviation of RMSE, one training clip missing"),
     "rmse_left_out": Metric("RMSE, clips left out", "length", "lower", "mean over training clips, each unseen"),
     "rmse_left_out_spread": Metric("± over these clips", "length", "none", "standard deviation of the same"),

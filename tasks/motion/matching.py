@@ -111,7 +111,7 @@ def match_prepared(ready: Prepared, query: Poses) -> Matched:
     """The same with a database that is ready, for poses that were checked."""
     done, way = [], ready.way
     for clip in range(len(query.clip_start) - 1):
-        asked = Posed(ready.known.training, _clip(query, clip, way.patch), ready.known)
+        asked = Posed(ready.known.training, one_clip(query, clip, way.patch), ready.known)
         frames, sources, distance = _match_clip(asked, ready)
         length = int(query.clip_start[clip + 1] - query.clip_start[clip])
         done.append([x[:length] for x in (asked.decode(believed(ready, frames), way.represent), sources, distance)])
@@ -166,7 +166,7 @@ def _reliability(ready: Prepared, values: np.ndarray) -> np.ndarray:
     for clip, (a, b) in enumerate(pairwise(poses.clip_start)):
         if len(lengths) < 2 or np.delete(lengths, clip).max() < patch:
             continue
-        asked = Posed(training, _clip(poses, clip, patch), ready.known)
+        asked = Posed(training, one_clip(poses, clip, patch), ready.known)
         made = to_numbers(_match_clip(asked, ready, skip=clip)[0])[: b - a] * unit
         agree += (made * to_numbers(values[a:b]) * unit).sum((0, 2))
         size += (made**2).sum((0, 2))
@@ -187,7 +187,7 @@ def _strides(frames: int, patch: int, levels: int) -> list[int]:
     return [2**level for level in range(count - 1, -1, -1)]
 
 
-def _clip(poses: Poses, clip: int, patch: int) -> Poses:
+def one_clip(poses: Poses, clip: int, patch: int) -> Poses:
     """One clip; shorter ones than a patch hold their last pose."""
     a, b = int(poses.clip_start[clip]), int(poses.clip_start[clip + 1])
     index = np.minimum(np.arange(a, max(b, a + patch)), b - 1)

@@ -1,0 +1,76 @@
+"""What is said about a pose before any method answers it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tasks.errors import InputError
+from tasks.evaluation.confidence import confidence_file, confidence_picture, evaluate_confidence
+from tasks.methods import partmm
+from tasks.motion.confidence import confidence
+from tasks.values import Animation, Poses
+from tests.analytic import planted
+from tests.analytic.test_methods import PAPER
+
+CLIPS = [planted.gesture(60, seed, amplitude) for seed, amplitude in ((1, 0.3), (2, 0.4), (3, 0.5), (4, 0.4))]
+SETTINGS = {"k": 3, "patch": 5, "dynamics": 0.0}
+
+
+@pytest.fixture(scope="module")
+def train():
+    return planted.training(CLIPS)
+
+
+def test_training_frames_are_their_own_sources_and_nothing_lies_farther_than_a_wild_pose(train):
+    same = confidence(train, planted.poses(CLIPS), **SETTINGS)
+    np.testing.assert_array_equal(same.windows[:, :, 0], np.arange(240)[:, None].repeat(len(train.parts.names), 1))
+    assert same.distance[:, :, 0].max() < 1e-5
+    assert same.parts == train.parts.names
+    wild = confidence(train, planted.poses([planted.gesture(30, 9, 2.0)]), **SETTINGS)
+    assert wild.outside.mean() > 0.95 > same.outside.mean()
+    assert wild.expected.min() > np.median(same.expected)
+
+
+def test_it_is_calibrated_by_clips_left_out(train):
+    """Motions of the training's own kind spread over the whole scale."""
+    query = planted.poses([planted.gesture(60, seed, 0.4) for seed in range(20, 28)])
+    found = confidence(train, query, **SETTINGS)
+    assert 0.3 < found.outside.mean() < 0.8
+    true = np.sqrt(
+        ((partmm.animate(train, query, **PAPER | {"represent": "residual"}).points - planted.truth(train, query)) ** 2)
+        .sum(2)
+        .mean(1)
+    )
+    assert 0.5 < np.median(found.expected) / np.median(true) < 2.0
+
+
+def test_its_rank_correlation_is_reported_and_files_name_the_sources(train):
+    test = planted.training([planted.gesture(30, 9, 0.8), planted.gesture(20, 8, 0.4)]).motion
+    query = planted.poses([planted.gesture(30, 9, 0.8), planted.gesture(20, 8, 0.4)])
+    found = confidence(train, query, **SETTINGS)
+    off = test.points + found.expected[:, None, None] * np.array([0.0, 1.0, 0.0], np.float32)
+    named = dict(zip(*(lambda m: (m.names, m.values))(evaluate_confidence(found, Animation(off), test)), strict=True))
+    assert named["confidence_spearman"] == pytest.approx(1.0, abs=1e-3)  # float32 points
+    assert {"outside_pct", "outside_pct@clip0", "outside_pct@clip1"} < set(named)
+    text = bytes(confidence_file(found, test, train.motion, name="planted").content).decode().splitlines()
+    assert len(text) == 1 + 50 * len(train.parts.names)
+    first = dict(zip(text[0].split(","), text[1].split(","), strict=True))
+    clip, frame = first["source_1"].split(":")
+    assert 60 * int(clip.removeprefix("clip")) + int(frame) == found.windows[0, 0, 0]
+    assert "expected" in confidence_picture(found, {"mine": Animation(off)}, test).svg
+
+
+def test_one_clip_leaves_nothing_to_judge_by(train):
+    alone = planted.training(CLIPS[:1])
+    found = confidence(alone, planted.poses(CLIPS[1:2]), **SETTINGS)
+    assert not found.expected.any()
+    assert evaluate_confidence(found, Animation(train.motion.points[60:120]), train.motion.take_clips([1])).names == ()
+
+
+def test_clips_shorter_than_a_patch_are_padded_and_bad_settings_refused(train):
+    poses = planted.poses(CLIPS)
+    short = Poses(poses.rotations[:3], poses.translations[:3], np.array([0, 3]))
+    assert len(confidence(train, short, **SETTINGS).expected) == 3
+    with pytest.raises(InputError, match=r"confidence\.k"):
+        confidence(train, short, **SETTINGS | {"k": 0})

@@ -15,6 +15,7 @@ from flows.garments import plan_garment, plan_manifest
 from flows.graph import Graph, Node
 from flows.intake import Output
 from flows.source import signature
+from tasks.driving.drive import existing
 from tasks.errors import InputError
 
 IN_VIDEOS = (("robust_lbs", "lbs"), ("fullmm",), ("partmm",))  # side by side: the first of each that was run
@@ -39,7 +40,7 @@ def plan(case: Case, graph: Graph) -> Planned:
 
     def add(stage: str, function: str, node: dict, outputs: str, title: str | None = None, **inputs: object) -> Node:
         settings = schema.arguments(function, node, case.seed if stage == "animate" else config["seed"])
-        path = settings.get("path") if stage == "dataset" else None
+        path = settings.get("path") if stage in ("dataset", "drive") else None
         about = {"outputs": tuple(outputs.split()), "case": name, "path": path, "title": title}
         return graph.add(stage, function, settings, **about, **inputs)
 
@@ -66,7 +67,25 @@ def plan(case: Case, graph: Graph) -> Planned:
         seen = {n: nodes[n] for n in ("confidence", "animation", "test")}
         metrics.append(add("evaluate", schema.EVALUATE_CONFIDENCE, {}, "metrics", **seen))
         metrics += _left_out(case, add, nodes)
+    if config["pipeline"] == "drive":
+        nodes |= _driven(config, add, nodes)
     return Planned(case, name, tuple(metrics), nodes)
+
+
+def _driven(config: dict, add, nodes: dict[str, Output]) -> dict[str, Output]:
+    """The method's answer to poses out of a file, for which there is no truth."""
+    existing(config["drive"]["path"])
+    if schema.animate_function(config["animate"]["function"]) == schema.FLOOR:
+        raise InputError(
+            "method", expected="a method that answers poses", found="the floor below all, fitted to the truth"
+        )
+    found = add(
+        "drive", schema.DRIVE, config["drive"], "motion poses about", skeleton=nodes["skeleton"], train=nodes["train"]
+    )
+    known = nodes | _database(add, nodes)
+    answer = _answer(config, add, known, nodes["train"], found["poses"], nodes["test"])
+    driven = {f"driven_{output}": found[output] for output in found.outputs}
+    return driven | {"driven_animation": answer}
 
 
 def _benchmark(case: Case, name: str, add) -> Planned:
@@ -220,7 +239,9 @@ def _exports(planned: Planned, graph: Graph) -> list[Output]:
     nodes, seed = planned.nodes, planned.case.seed
     name = _file_name(planned.name) + (f"_seed{seed}" if seed else "")
     moving = {"motion": "train", "poses": "poses", "reconstruction": "reconstruction"}
-    if "animation" in nodes:
+    if "driven_animation" in nodes:
+        moving = {n: f"driven_{n}" for n in ("motion", "poses", "animation")}
+    elif "animation" in nodes:
         moving = {"motion": "test", "poses": "query", "reconstruction": "posed", "animation": "animation"}
     values = {n: n for n in ("canonical", "skinning", "skeleton")} | moving
     values = {n: nodes[value] for n, value in values.items() if value in nodes}
@@ -317,6 +338,9 @@ def _pictures(shown: list[Planned], graph: Graph) -> list[Node]:
         errors = add("error_picture", "test canonical", {"focus": labels[-1]}, animations=animations)
         pictures.append(_confidence_picture(lead, animations, graph))
         pictures.insert(0, errors)
+    if "driven_animation" in lead.nodes:
+        moving = {"animation": lead.nodes["driven_animation"], "motion": lead.nodes["driven_motion"]}
+        pictures.insert(0, add("driven_picture", "canonical", **moving))
     return pictures
 
 

@@ -113,6 +113,9 @@ def write(work: Work, refs: dict[str, Ref], computed: set[str], store: Store) ->
     settings = cases[0].config["report"]
     rows = join([_rows(p, refs, store) for p in planned])
     about = [_about(p, refs, store) for p in planned]
+    about += [
+        store.load(refs[n.id], o) for n, o in (p.nodes["driven_about"] for p in planned if "driven_about" in p.nodes)
+    ]
     remarks = list(dict.fromkeys(f"{a.name}: {note}." for a in about for note in a.notes))
     said = [f"Not run: {what}, {why}." for what, why in work.experiment.not_run] + _fit_notes(planned, refs)
     tables = tables_of(cases, rows, remarks, said)

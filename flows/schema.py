@@ -86,7 +86,8 @@ EXPORTS = {
 PER_CLIP = ("clip", "cycles", "turn", "slow")  # settings of a motion that differ from clip to clip
 PER_RUN = ("fps", "frames")  # settings of garments that several stages share
 
-PIPELINES = ("animate", "rig", "reconstruct", "make_garments", "make_scenes", *BENCHMARKS)
+DRIVE = "tasks.driving.drive:driving_poses"
+PIPELINES = ("animate", "rig", "drive", "reconstruct", "make_garments", "make_scenes", *BENCHMARKS)
 
 REPORT = {
     "name": str,
@@ -168,6 +169,7 @@ def schema(config: dict, sweep: dict[str, object]) -> dict[str, object]:
         **_method(config),
         "evaluate": settings(EVALUATE) | settings(EVALUATE_RIG) | LEFT_OUT,
         "report": REPORT,
+        **({"drive": settings(DRIVE)} if pipeline == "drive" else {}),
         "export": {"formats": list[Literal[tuple(EXPORTS)]]},
         "store": {"path": str},
         "memory": {"max_gb": float | None},

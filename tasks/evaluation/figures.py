@@ -170,8 +170,23 @@ def worn_figure(
         colours = np.repeat([CLAY, part_colours(1)[0]], [len(body), len(worn)], axis=0)
         camera = _cameras(points[None], WORN_FROM)[0]
         pictures.append(panel(shape, camera, points, colours, [caption], theme))
+    return render.finish(_sheet(pictures, theme))
+
+
+def frames_figure(
+    panels: Mapping[str, np.ndarray], faces: np.ndarray | None, *, azimuth: float, theme: str = "light"
+) -> np.ndarray:
+    """One shape in several frames. panels: caption -> points (N, 3); faces: (T, 3) or None."""
+    shape = shape_of(next(iter(panels.values())), faces)
+    cameras = _cameras(np.stack(list(panels.values())), azimuth)
+    shown = zip(panels.items(), cameras, strict=True)
+    return render.finish(_sheet([panel(shape, c, points, CLAY, [text], theme) for (text, points), c in shown], theme))
+
+
+def _sheet(pictures: list[np.ndarray], theme: str) -> np.ndarray:
+    """Pictures of any size, four in a row."""
     tallest, widest = (max(p.shape[axis] for p in pictures) for axis in (0, 1))
-    return render.finish(grid([_on_paper(p, tallest, widest, theme) for p in pictures], 4, theme))
+    return grid([_on_paper(p, tallest, widest, theme) for p in pictures], 4, theme)
 
 
 def _on_paper(picture: np.ndarray, height: int, width: int, theme: str) -> np.ndarray:

@@ -75,5 +75,13 @@ def scene_picture(capture: Capture, views: Capture) -> Picture:
     return Picture("scene", f"{capture.name}: training images, and views held out", _png(contact_sheet(capture, views)))
 
 
+def driven_picture(canonical: Canonical, motion: Motion, animation: Animation) -> Picture:
+    """The character at even steps of a motion for which there is no truth. motion: its joints, for the names."""
+    frames = np.unique(np.linspace(0, len(animation.points) - 1, 8).astype(int))
+    panels = {f"frame {f}": animation.points[f] for f in frames}
+    pixels = figures.frames_figure(panels, canonical.faces, azimuth=0.5)
+    return Picture("driven", f"driven by {motion.name}, at even steps", _png(pixels))
+
+
 def _png(pixels: np.ndarray) -> np.ndarray:
     return np.frombuffer(render.png(pixels), np.uint8)

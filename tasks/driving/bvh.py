@@ -1,0 +1,107 @@
+"""Reading Biovision hierarchies: a skeleton and its motion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from tasks.errors import InputError
+from tasks.geometry.rotations import from_rotation_vector
+
+MOST = 10**8  # numbers of motion: more would not fit
+
+
+@dataclass(frozen=True)
+class Driver:
+    """A motion on a skeleton of its own. names: J; parents: (J,), -1 for the root, which comes first; joints: (J, 3)
+    rest positions; rotations: (F, J, 3, 3) local, identity at rest; root: (F, 3) its position; fps: frames a second."""
+
+    names: tuple[str, ...]
+    parents: np.ndarray
+    joints: np.ndarray
+    rotations: np.ndarray
+    root: np.ndarray
+    fps: float
+
+
+@dataclass
+class _Joint:
+    name: str
+    parent: int
+    offset: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    channels: list[str] = field(default_factory=list)
+
+
+def read_bvh(path: Path) -> Driver:
+    """A .bvh file. Rotations are taken in the order of the channels; positions of joints but the root are left aside.
+
+    Raises InputError for what is no BVH, and for a motion of another size than the header says.
+    """
+    head, found, motion = path.read_text("utf-8", "replace").partition("MOTION")
+    if not head.lstrip().startswith("HIERARCHY") or not found:
+        raise InputError(str(path), expected="a BVH file (HIERARCHY … MOTION …)", found=repr(head[:40]))
+    try:
+        joints = _hierarchy(head.split()[1:])
+        lines = motion.split("\n")
+        header = [line.strip() for line in lines if ":" in line]
+        count, seconds = (float(line.rpartition(":")[2]) for line in header[:2])
+        numbers = np.array(" ".join(line for line in lines if ":" not in line).split(), np.float64)
+    except (ValueError, IndexError) as error:
+        raise InputError(str(path), expected="a BVH file", found=f"damaged text ({error})") from None
+    columns = sum(len(joint.channels) for joint in joints)
+    if count < 1 or columns < 1 or not seconds > 0 or len(numbers) != count * columns:
+        expected = f"{count:.0f} frames of {columns} numbers, and a frame time"
+        raise InputError(f"{path}: MOTION", expected=expected, found=f"{len(numbers)} numbers, {seconds:g} s")
+    return _driver(joints, numbers.reshape(int(count), columns), 1 / seconds)
+
+
+def _hierarchy(words: list[str]) -> list[_Joint]:
+    joints: list[_Joint] = []
+    stack: list[int] = []
+    skipped, at = 0, 0
+    while at < len(words):
+        word = words[at]
+        if word in ("ROOT", "JOINT"):
+            name_end = words.index("{", at)
+            joints.append(_Joint("_".join(words[at + 1 : name_end]), stack[-1] if stack else -1))
+            stack.append(len(joints) - 1)
+            at = name_end + 1
+        elif word == "End":  # End Site { OFFSET x y z }
+            at = words.index("}", at) + 1
+            skipped += 1
+        elif word == "OFFSET":
+            joints[stack[-1]].offset = [float(v) for v in words[at + 1 : at + 4]]
+            at += 4
+        elif word == "CHANNELS":
+            count = int(words[at + 1])
+            joints[stack[-1]].channels = words[at + 2 : at + 2 + count]
+            at += 2 + count
+        elif word == "}":
+            stack.pop()
+            at += 1
+        else:
+            raise ValueError(f"unknown word {word[:20]!r}")
+    if not joints or sum(joint.parent < 0 for joint in joints) != 1:
+        raise ValueError("not one ROOT")
+    return joints
+
+
+def _driver(joints: list[_Joint], rows: np.ndarray, fps: float) -> Driver:
+    parents = np.array([joint.parent for joint in joints])
+    rest = np.zeros((len(joints), 3))
+    rotations = np.tile(np.eye(3), (len(rows), len(joints), 1, 1))
+    root = np.tile(joints[0].offset, (len(rows), 1))
+    column = 0
+    for j, joint in enumerate(joints):
+        rest[j] = joint.offset if joint.parent < 0 else rest[joint.parent] + joint.offset
+        for channel in joint.channels:
+            axis = "XYZ".index(channel[:1].upper())
+            if channel.lower().endswith("rotation"):
+                turn = from_rotation_vector(np.radians(rows[:, column])[:, None] * np.eye(3)[axis])
+                rotations[:, j] = rotations[:, j] @ turn
+            elif j == 0:
+                root[:, axis] = rows[:, column]
+            column += 1
+    return Driver(tuple(joint.name for joint in joints), parents, rest, rotations, root, fps)

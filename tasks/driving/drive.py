@@ -1,0 +1,214 @@
+"""Poses for a character out of a file of somebody else's motion: joints matched by name, limbs brought into line."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from tasks.driving.bvh import Driver, read_bvh
+from tasks.errors import InputError
+from tasks.geometry import kinematics
+from tasks.geometry.rotations import from_rotation_vector, project_so3, to_rotation_vector
+from tasks.values import About, Motion, Poses, Skeleton
+
+ARRAYS = ("joint_names", "joint_parents", "joints", "joint_rotations", "joint_translations", "fps")
+EXPECTED = "a .bvh or .npz file of poses"
+ROUNDED = 1e-2  # of a frame: files give the frame time in few digits
+LEAST = 0.5  # of the joints that move skin: with fewer matched it is another creature
+
+
+def driving_poses(
+    skeleton: Skeleton, train: Motion, *, path: str | None, rename: list[str], first: int, frames: int | None
+) -> tuple[Motion, Poses, About]:
+    """The motion of a file on this skeleton: its joints' path (F, J, 3) as a motion, the poses, and what was left out.
+
+    path: a .bvh, or an .npz as the export writes it (joint_names, joint_parents, joints, joint_rotations,
+    joint_translations, fps). Joints are matched by name, whatever their order; capitals, separators and a prefix before
+    ":" do not count. rename: "theirs=ours" where names differ. Joints without a counterpart keep their rest pose. Each
+    matched joint takes the driver's rotation in the world, after its own bones at rest have been turned onto the
+    driver's; the lowest joint keeps the driver's height above the ground, scaled. Sampled at the training data's rate.
+    first, frames: where to begin, captures often have a T pose in front, and how many at most.
+    Raises InputError where the file cannot be read or too few names match.
+    """
+    source = existing(path)
+    driver = _sampled(
+        read_bvh(source) if source.suffix.lower() == ".bvh" else _read_npz(source), train.fps, first, frames
+    )
+    match = match_names(skeleton, driver.names, rename, where=str(source))
+    poses = retarget(skeleton, driver, match)
+    turned = kinematics.forward(skeleton.parents, skeleton.joints, poses.rotations, poses.translations)
+    at = kinematics.joint_positions(turned, skeleton.joints)
+    name = re.sub(r"\s+", "_", source.stem)
+    left = [skeleton.names[j] for j in np.flatnonzero((match < 0) & (skeleton.weights.sum(0) > 0))]
+    notes = (f"driven by {name}, {len(at)} frames", *((f"joints left at rest: {', '.join(left)}",) if left else ()))
+    motion = Motion(name, at.astype(np.float32), None, poses.clip_start, (name,), train.fps, train.unit)
+    return motion, poses, About(train.name, notes)
+
+
+def existing(path: str | None) -> Path:
+    """The file of poses. Raises InputError where none is named or there."""
+    if not path:
+        raise InputError("drive.path", expected=EXPECTED, found="nothing", do="add drive.path=FILE to the command")
+    source = Path(path).expanduser()
+    if not source.is_file():
+        raise InputError(path, expected=EXPECTED, found="no such file", do="check drive.path")
+    return source
+
+
+def match_names(skeleton: Skeleton, theirs: tuple[str, ...], rename: list[str], *, where: str) -> np.ndarray:
+    """(J,) which of their joints each joint of the skeleton follows, -1 for none.
+
+    Raises InputError for a renaming of unknown joints, for a root without a counterpart and for too few matches.
+    """
+    index = {_plain(name): j for j, name in reversed(list(enumerate(theirs)))}
+    match = np.array([index.get(_plain(name), -1) for name in skeleton.names])
+    for entry in rename:
+        their, _, our = entry.partition("=")
+        for name, valid in ((their, theirs), (our, skeleton.names)):
+            if name not in valid:
+                raise InputError("drive.rename", expected=f"theirs=ours, among {', '.join(valid)}", found=repr(entry))
+        match[skeleton.names.index(our)] = theirs.index(their)
+    moves = skeleton.weights.sum(0) > 0
+    if match[0] < 0 or (match[moves] >= 0).mean() < LEAST:
+        raise InputError(
+            f"{where}: joints",
+            expected=f"the names of the skeleton's joints ({', '.join(skeleton.names)})",
+            found=f"{int((match >= 0).sum())} of {len(match)} among {', '.join(theirs)}",
+            do="set drive.rename=[THEIRS=OURS,...], the root first",
+        )
+    return match
+
+
+def retarget(skeleton: Skeleton, driver: Driver, match: np.ndarray) -> Poses:
+    """The driver's world rotations W on the skeleton: joint j turns as W_match(j) A_j, with A_j the rotation that
+    brings its bones at rest onto the driver's; see :func:`driving_poses`."""
+    parents, rest = np.asarray(skeleton.parents), skeleton.joints.astype(np.float64)
+    world = np.empty_like(driver.rotations)
+    for j, p in enumerate(driver.parents):
+        world[:, j] = driver.rotations[:, j] if p < 0 else world[:, p] @ driver.rotations[:, j]
+    frames = len(world)
+    into_line, scale = _into_line(parents, rest, driver, match)
+    ours = np.empty((frames, len(parents), 3, 3))
+    local = np.tile(np.eye(3), (frames, len(parents), 1, 1))
+    for j, p in enumerate(parents):
+        above = ours[:, p] if p >= 0 else np.tile(np.eye(3), (frames, 1, 1))
+        ours[:, j] = world[:, match[j]] @ into_line[j] if match[j] >= 0 else above
+        local[:, j] = np.swapaxes(above, -1, -2) @ ours[:, j]
+    shift = np.zeros((frames, len(parents), 3))
+    shift[:, 0] = scale * (driver.root - driver.root[0])
+    shift[:, 0, 1] = 0
+    low = _lowest(parents, rest, local, shift)
+    theirs = np.zeros((frames, len(driver.parents), 3))
+    theirs[:, 0] = driver.root - driver.joints[0]
+    height = _lowest(driver.parents, driver.joints, driver.rotations, theirs)
+    shift[:, 0, 1] = rest[:, 1].min() + scale * (height - height.min()) - low
+    clip = np.array([0, frames], np.int64)
+    return Poses(project_so3(local).astype(np.float32), shift.astype(np.float32), clip)
+
+
+def _into_line(parents: np.ndarray, rest: np.ndarray, driver: Driver, match: np.ndarray) -> tuple[np.ndarray, float]:
+    """(J, 3, 3) rotations of the rest pose onto the driver's, joint by joint, and the driver's size in ours."""
+    out = np.tile(np.eye(3), (len(parents), 1, 1))
+    own, theirs = 0.0, 0.0
+    for j, p in enumerate(parents):
+        ends = _matched_below(parents, match, j)
+        if match[j] < 0 or not ends or _placed_on_parent(driver, match[j]):
+            out[j] = out[p] if p >= 0 else np.eye(3)
+            continue
+        a = rest[ends] - rest[j]
+        b = driver.joints[match[ends]] - driver.joints[match[j]]
+        own, theirs = own + np.linalg.norm(a, axis=1).sum(), theirs + np.linalg.norm(b, axis=1).sum()
+        a, b = (v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-9) for v in (a, b))
+        spread = np.linalg.svd(a)[1]
+        if len(ends) > 1 and spread[1] > 0.3:  # two directions and more decide a rotation
+            out[j] = project_so3(b.T @ a)
+        else:
+            out[j] = _onto(a.mean(0), b.mean(0))
+    return out, float(own / max(theirs, 1e-9))
+
+
+def _placed_on_parent(driver: Driver, joint: int) -> bool:
+    """Collar bones of some captures begin at the neck: where their bones point says nothing about a pose."""
+    above = driver.parents[joint]
+    size = np.ptp(driver.joints, axis=0).max()
+    return above >= 0 and np.linalg.norm(driver.joints[joint] - driver.joints[above]) < 1e-3 * size
+
+
+def _matched_below(parents: np.ndarray, match: np.ndarray, joint: int) -> list[int]:
+    """The nearest matched joints below a joint, on every branch."""
+    found, pending = [], list(np.flatnonzero(parents == joint))
+    while pending:
+        j = int(pending.pop(0))
+        if match[j] >= 0:
+            found.append(j)
+        else:
+            pending += list(np.flatnonzero(parents == j))
+    return found
+
+
+def _onto(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The smallest rotation that brings direction a onto direction b."""
+    a, b = (v / max(np.linalg.norm(v), 1e-12) for v in (a, b))
+    axis = np.cross(a, b)
+    sine, cosine = np.linalg.norm(axis), a @ b
+    if sine < 1e-9:  # opposite: half a turn about anything across
+        axis, sine = np.cross(a, np.eye(3)[np.argmin(np.abs(a))]), 1e-9
+        cosine = np.sign(cosine)
+    return from_rotation_vector(axis / max(np.linalg.norm(axis), 1e-12) * np.arctan2(sine, cosine))
+
+
+def _lowest(parents: np.ndarray, rest: np.ndarray, rotations: np.ndarray, translations: np.ndarray) -> np.ndarray:
+    """The height of the lowest joint in each frame. (F,)"""
+    posed = kinematics.forward(parents, rest, rotations, translations)
+    return kinematics.joint_positions(posed, rest)[..., 1].min(1)
+
+
+def _sampled(driver: Driver, fps: float, first: int, frames: int | None) -> Driver:
+    """The same motion at another rate, from a frame on, cut to so many frames."""
+    if frames is not None and frames < 1:
+        raise InputError("drive.frames", expected="1 or more, or null for all", found=str(frames))
+    last = len(driver.root) - 1
+    count = int(np.floor(last * fps / driver.fps + ROUNDED)) + 1
+    if not 0 <= first < count:
+        raise InputError("drive.first", expected=f"0 to {count - 1}", found=str(first))
+    at = np.minimum(np.arange(count)[first:][:frames] * (driver.fps / fps), last)
+    a = np.minimum(at.astype(int), max(last - 1, 0))
+    b, t = np.minimum(a + 1, last), (at - a)[:, None]
+    step = to_rotation_vector(np.swapaxes(driver.rotations[a], -1, -2) @ driver.rotations[b])
+    rotations = driver.rotations[a] @ from_rotation_vector(t[..., None] * step)
+    return replace(driver, rotations=rotations, root=(1 - t) * driver.root[a] + t * driver.root[b], fps=fps)
+
+
+def _read_npz(path: Path) -> Driver:
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            missing = [name for name in ARRAYS if name not in archive.files]
+            if missing:
+                found = ", ".join(sorted(archive.files))
+                raise InputError(str(path), expected=", ".join(ARRAYS), found=found, do=f"add {', '.join(missing)}")
+            names, parents, joints, rotations, moved, fps = (archive[name] for name in ARRAYS)
+    except (ValueError, OSError, EOFError) as error:
+        raise InputError(str(path), expected="a .bvh or a plain .npz", found=str(error)[:120]) from None
+    count = len(names)
+    fits = parents.shape == (count,) and joints.shape == (count, 3) and rotations.shape[1:] == (count, 3, 3)
+    if not fits or moved.shape != rotations.shape[:3]:
+        shapes = ", ".join(str(a.shape) for a in (parents, joints, rotations, moved))
+        raise InputError(str(path), expected=f"arrays of {count} joints", found=shapes)
+    off = np.abs(np.swapaxes(rotations, -1, -2) @ rotations - np.eye(3)).max((-1, -2))
+    if not (off <= 1e-3).all() or (np.linalg.det(rotations) < 0).any():
+        f, j = np.unravel_index(int(np.nanargmax(np.where(np.isfinite(off), off, np.inf))), off.shape)
+        found = f"frame {f}, joint {names[j]}"
+        raise InputError(f"{path}: joint_rotations", expected="rotation matrices", found=found)
+    root = joints[0] + moved[:, 0]
+    place = joints.astype(np.float64)
+    return Driver(
+        tuple(map(str, names)), parents, place, rotations.astype(np.float64), root.astype(np.float64), float(fps)
+    )
+
+
+def _plain(name: str) -> str:
+    """A joint's name without prefix, separators and capitals."""
+    return re.sub(r"[^a-z0-9]", "", name.rpartition(":")[2].lower().removeprefix("mixamorig"))

@@ -15,11 +15,13 @@ from scipy.spatial import cKDTree
 from tasks.benchmarks.cost import threads_held
 from tasks.errors import InputError
 from tasks.evaluation.metrics import declared
-from tasks.geometry.measure import diagonal
 from tasks.values import Canonical, Metrics
 
-DISTANCE = 3.0  # of the camera, in diagonals
-FILL = 0.9  # of the image that a diagonal is as long as
+DISTANCE = 3.0  # of the camera, in widths of the shape as it is seen
+FILL = 0.8  # of the image that the shape is as wide or high as, at its middle
+# cameras that see +y upwards: from +z, and from +x
+FRONT = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
+SIDE = ((0.0, 0.0, -1.0), (0.0, -1.0, 0.0), (-1.0, 0.0, 0.0))
 Scene = dict[str, np.ndarray]
 Work = Callable[[], object]
 
@@ -55,16 +57,21 @@ def benchmark_rasterizer(
 
 
 def covering(canonical: Canonical, count: int, size: int, seed: int) -> Scene:
-    """Spheres spread over a shape, each as large as the mean distance to its three nearest, and a camera before it."""
+    """Spheres spread over a shape, and a camera before its broader side.
+
+    Each sphere's scale is the mean distance to its three nearest, as 3DGS begins with.
+    """
     import trimesh
 
     mesh = trimesh.Trimesh(canonical.points, canonical.faces, process=False)
     points = trimesh.sample.sample_surface(mesh, count, seed=seed)[0]
     g = np.random.default_rng(seed)
-    length = diagonal(canonical.points)
-    view = np.diag([1.0, -1.0, -1.0, 1.0])  # the data's y is up, the camera's down
-    middle = (canonical.points.min(0) + canonical.points.max(0)) / 2
-    view[:3, 3] = np.array([0.0, 0.0, DISTANCE * length]) - view[:3, :3] @ middle
+    low, high = canonical.points.min(0), canonical.points.max(0)
+    extent = (high - low).astype(np.float64)
+    view = np.eye(4)
+    view[:3, :3] = SIDE if extent[0] < extent[2] else FRONT
+    width = max(extent[1], extent[2] if extent[0] < extent[2] else extent[0])
+    view[:3, 3] = np.array([0.0, 0.0, DISTANCE * width]) - view[:3, :3] @ ((low + high) / 2)
     focal = FILL * DISTANCE * size
     scene = {
         "means": points,

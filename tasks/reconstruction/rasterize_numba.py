@@ -10,7 +10,7 @@ from tasks.geometry.parallel import for_chunks
 from tasks.reconstruction import splat_blend, splat_project
 from tasks.reconstruction.splat_blend import DEPTH, MOMENTS, SPLAT, TILE
 
-GAUSSIANS = 4096  # a chunk of them
+GAUSSIANS = 16384  # a chunk of them: a thread costs as much as a few thousand
 TILES = 64
 
 

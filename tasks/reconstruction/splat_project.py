@@ -247,7 +247,7 @@ def project_backward(
     of_means, of_scales, of_opacities, of_sh, of_quaternions = gradients
     total, shift = np.empty(MOMENTS, means.dtype), np.empty(3, means.dtype)
     basis, basis_slope = np.empty(16, means.dtype), np.empty((16, 3), means.dtype)
-    centre = camera_centre(view)
+    unit, centre = np.empty(3, means.dtype), camera_centre(view)
     for row in range(first, last):
         i = order[row]
         s = splats[row]
@@ -270,7 +270,7 @@ def project_backward(
         gx = -(s[A] * total[5] + s[B] * total[6]) * intrinsics[0, 0] / z
         gy = -(s[B] * total[5] + s[C] * total[6]) * intrinsics[1, 1] / z
         dz -= gx * x / z + gy * y / z
-        back_shade(means[i], centre, sh[i], s, total, basis, basis_slope, of_sh[i], shift)
+        back_shade(means[i], centre, sh[i], s, total, unit, basis, basis_slope, of_sh[i], shift)
         for k in range(3):
             of_means[i, k] = (dx + gx) * view[0, k] + (dy + gy) * view[1, k] + dz * view[2, k] + shift[k]
 
@@ -343,10 +343,9 @@ def back_quaternion(q, g, out):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def back_shade(mean, centre, sh, splat, total, basis, basis_slope, of_sh, of_mean):
+def back_shade(mean, centre, sh, splat, total, unit, basis, basis_slope, of_sh, of_mean):
     """Gradients by the coefficients and, through the direction, by the mean."""
     real = mean.dtype.type
-    unit = np.empty(3, mean.dtype)
     count = len(sh)
     distance = direction(mean, centre, unit)
     sh_basis(unit, count, basis)

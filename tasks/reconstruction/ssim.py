@@ -17,7 +17,7 @@ from tasks.geometry.parallel import for_chunks
 HALF = 5
 SIGMA = 1.5
 C1, C2 = 0.01**2, 0.03**2
-ROWS = 32  # a chunk of them
+ROWS = 64  # a chunk of them
 FAST = {"contract", "nsz", "arcp"}
 
 

@@ -242,7 +242,7 @@ def test_a_rasterizer_that_is_ours_has_ratios_near_one(monkeypatch):
         def backward(self, of_rgb, of_alpha):
             assert of_rgb.shape == (40, 40, 3)
             assert of_alpha.shape == (40, 40)
-            assert 0.1 < float(self.images[1].mean()) < 0.7  # the ball fills part of the image
+            assert 0.4 < float(self.images[1].mean()) < 0.9  # a ball four fifths as wide as the image, and its blur
 
     monkeypatch.setattr(rasterizer, "_library", lambda: Twin)
     found = named(rasterizer.benchmark_rasterizer(a_ball(), **RASTER))

@@ -38,7 +38,6 @@ def reconstruct(config: dict, add) -> tuple[Nodes, list[Node]]:
         truth = _part(config, add, nodes)
         nodes |= _scene(config, add, truth)
     nodes |= _fit(config, add, nodes["capture"])
-    nodes["about"] = add("about", schema.ABOUT, {}, "about", motion=nodes.get("motion", nodes["paths"]))["about"]
     metrics = [_compare(config, add, nodes, nodes["reconstruction"], nodes["views"])]
     if truth:
         inputs = {"reconstruction": nodes["reconstruction"], "truth": truth}
@@ -92,8 +91,7 @@ def _captured(config: dict, add) -> Nodes:
     nodes = _images(config, add)
     nodes |= _fit(config, add, nodes["capture"])
     motion = nodes["paths"]
-    about = add("about", schema.ABOUT, {}, "about", motion=motion)["about"]
-    return nodes | {"motion": motion, "about": about} | _split(config, add, motion)
+    return nodes | {"motion": motion} | _split(config, add, motion)
 
 
 def _rendered(config: dict, add) -> Nodes:
@@ -113,7 +111,8 @@ def _split(config: dict, add, motion: Output) -> Nodes:
 
 def _images(config: dict, add) -> Nodes:
     loaded = add("dataset", schema.load_function(config["dataset"]["kind"]), config["dataset"], "capture views")
-    return {"capture": loaded["capture"], "views": loaded["views"]}
+    about = add("about", schema.ABOUT_CAPTURE, {}, "about", capture=loaded["capture"])["about"]
+    return {"capture": loaded["capture"], "views": loaded["views"], "about": about}
 
 
 def _part(config: dict, add, nodes: Nodes) -> Output:

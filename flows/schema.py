@@ -20,6 +20,7 @@ RIGID = "tasks.bones.rigid:rigid_skinning"
 GAUSSIAN_BONES = "tasks.bones.gaussian:gaussian_bones"
 BONES = {"ssdr": SSDR, "clusters": RIGID, "gaussian": GAUSSIAN_BONES}
 ABOUT = "tasks.datasets.validate:about"
+ABOUT_CAPTURE = "tasks.captures.validate:about"
 SPLIT = "tasks.datasets.split:split"
 CANONICAL = "tasks.datasets.canonical:canonical"
 SURFACE = "tasks.skeleton.surface:closed_surface"

@@ -18,9 +18,11 @@ joints (J, 3) at rest; rotations (F, J, 3) rotation vectors in radians, or (F, J
 relative to rest (SMPL's `global_orient` and `body_pose`); root (F, 3), the shift of the root joint in the world, or
 instead translations (F, J, 3), those of all joints in their parents' frames, where the skeleton stretches.
 
-DNA-Rendering: K and RT of each camera in the annotation file; RT is camera to world, so invert it; undistort by D;
-masks and SMPL-X parameters lie beside them. ActorsHQ: calibration.csv gives rotation vector and translation of each
-camera and its focal lengths and centre as shares of the image's size; masks come as images of their own.
+DNA-Rendering: K, D and RT of each camera lie in the annotation file, masks and SMPL-X parameters beside them; RT is
+camera to world, so invert it, and undistort by D. ActorsHQ: each row of calibration.csv holds a camera's rotation
+vector and place, also camera to world, and focal lengths and centre as shares of the image's width and height; masks
+are images of their own, named like the frames. Cameras left in the wrong direction are refused: they look away from
+each other's subject.
 """
 
 from __future__ import annotations

@@ -288,7 +288,7 @@ def _views_pictures(planned: list[Planned], graph: Graph) -> list[Node]:
     for cases in seen.values():
         rendered = {label: p.nodes["rendered"] for label, p in zip(_labels(cases), cases, strict=True)}
         function, truth = "tasks.evaluation.pictures:views_picture", cases[0].nodes["seen"]
-        inputs = {"truth": truth, "rendered": dict(list(rendered.items())[-PANELS:])}
+        inputs = {"truth": truth, "rendered": dict(list(rendered.items())[:PANELS])}
         found.append(graph.add("figures", function, {}, outputs=("picture",), case=cases[0].case.data, **inputs))
     return found
 

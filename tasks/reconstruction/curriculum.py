@@ -13,6 +13,8 @@ import numpy as np
 from tasks.reconstruction.hull import INSIDE, Start, nearest_views
 from tasks.values import Capture
 
+EDGE = 5  # frames at an end of the window that every other step goes to while it grows
+
 
 @dataclass(frozen=True)
 class Schedule:
@@ -78,6 +80,16 @@ class Window:
         for low, high in frames:
             used |= (self._frame >= low) & (self._frame <= high)
         return np.flatnonzero(used)
+
+    def edge(self, frames: list[tuple[int, int]]) -> np.ndarray:
+        """The images of the frames that came in last, at ends of the window that go on growing."""
+        late = np.zeros(len(self._frame), bool)
+        for clip, (low, high) in enumerate(frames):
+            first, end = self._bounds(clip)
+            near_low = (self._frame >= low) & (self._frame < low + EDGE) & (low > first)
+            near_high = (self._frame <= high) & (self._frame > high - EDGE) & (high < end - 1)
+            late |= (near_low | near_high) & (low <= high)
+        return np.flatnonzero(late)
 
     def _bounds(self, clip: int) -> tuple[int, int]:
         return int(self._clip_start[clip]), int(self._clip_start[clip + 1])

@@ -11,7 +11,6 @@ import torch
 from scipy.spatial import cKDTree
 
 from tasks.errors import InputError
-from tasks.geometry.rotations import to_quaternion
 from tasks.reconstruction import checkpoint, cuts, density
 from tasks.reconstruction.adam import Adam
 from tasks.reconstruction.curriculum import Schedule, Window
@@ -132,10 +131,9 @@ class Fitting:
         loss.backward()
         self.pull.add(means.grad)
         self.iteration += 1
-        falls = self.recipe.rate_end ** (self.iteration / self.recipe.iterations)
         for name, value in self.learned().items():
             if value.grad is not None:
-                self.adam.step(name, value, falls * self._rate(name), self.iteration)
+                self.adam.step(name, value, self._rate(name), self.iteration)
         self.sums += loss.item(), squared.item()
         self._after()
 
@@ -170,7 +168,7 @@ class Fitting:
         if recipe.arap == "off":
             return {}
         rigid, kept = self.neighbours.rigidity(moved.carriers, moved.turns if recipe.arap == "own" else None)
-        falls = recipe.rigidity_end ** (self.iteration / recipe.iterations) if recipe.rigidity_end > 0 else 1.0
+        falls = self._fall(recipe.rigidity_end)
         return {"arap": falls * recipe.arap_weight * rigid, "distance": falls * recipe.distance_weight * kept}
 
     def _roughness(self) -> dict[str, torch.Tensor]:
@@ -194,7 +192,12 @@ class Fitting:
 
     def _rate(self, name: str) -> float:
         known = {"means": "means", "log_scales": "scales", "opacities": "opacities", "sh": "colours"}
-        return getattr(self.recipe, f"rate_{known.get(name, 'deformation')}")
+        return getattr(self.recipe, f"rate_{known.get(name, 'deformation')}") * self._fall(self.recipe.rate_end)
+
+    def _fall(self, end: float) -> float:
+        """What is left of a rate or a weight."""
+        along = self.iteration / self.recipe.iterations
+        return end**along if end > 0 else 1.0 - along
 
     # what is due before and after a step
 
@@ -231,7 +234,8 @@ class Fitting:
         return spline(np.asarray(self.capture.clip_start), max(1.0, spacing))
 
     def _next_image(self) -> int:
-        """Every image in use once, in random order, then again: those of frames that came in since, too."""
+        """Every image in use once, in random order, then again; while the window grows every other step goes to its
+        edge, so that each frame is followed before the next one comes in."""
         if self.deformation is not None:
             frames = self.window.frames(self.schedule.growth(self.iteration))
             if frames != self.frames:
@@ -239,6 +243,10 @@ class Fitting:
                 for clip, (first, last) in enumerate(frames):
                     if last >= first:
                         self.deformation.copy_outwards(first, last, clip)
+        if self.iteration % 2 and self.frames:
+            edge = self.window.edge(self.frames)
+            if len(edge):
+                return int(self.rng.choice(edge))
         if len(self.queue) == 0:
             used = self.window.images(self.frames) if self.frames else self.window.first_images
             self.queue = self.rng.permutation(used)
@@ -341,17 +349,14 @@ class Fitting:
         for name, mean in self.mean.items():
             learned[name].data.copy_(mean)
         count, frames = len(self.params["means"]), len(capture.times)
-        self.workspace.check_memory(4e-9 * frames * count * 9)
+        self.workspace.check_memory(4e-9 * frames * count * (5 if recipe.deltas else 3))
         points = np.empty((frames, count, 3), np.float32)
-        rotations = np.empty((frames, count, 4), np.float32)
         scaling, opacity = (np.empty((frames, count), np.float32) if recipe.deltas else None for _ in range(2))
         with torch.no_grad():
             opacities = self.params["opacities"]
             for f in range(frames):
                 moved = self.deformation.at(f, self.params["means"])
                 points[f] = moved.means.cpu().numpy() * self.unit + self.centre
-                turns = self.deformation.turns(f, self.params["means"])
-                rotations[f] = to_quaternion(turns)
                 if recipe.deltas:
                     scaling[f] = torch.exp(moved.log_scales[:, 0]).cpu().numpy()
                     now = torch.sigmoid(opacities + moved.opacities) / torch.sigmoid(opacities)
@@ -368,7 +373,7 @@ class Fitting:
             name=capture.name,
             gaussians=gaussians,
             points=points,
-            rotations=rotations,
+            rotations=None,  # isotropic Gaussians have no direction
             scaling=scaling,
             opacity=opacity,
             times=capture.times,

@@ -73,11 +73,6 @@ class Mlp:
         turns = rotation_of(carried[:, 3:6])
         return Deformed(means + own[:, :3], rest + carried[:, :3], turns, scales, opacities)
 
-    def turns(self, frame: int, means: torch.Tensor) -> np.ndarray:
-        """(N, 3, 3) rotations of the Gaussians."""
-        with torch.no_grad():
-            return rotation_of(self.out(frame, means)[:, 3:6]).cpu().numpy()
-
     def roughness(self) -> torch.Tensor | None:
         """The bands of time bound how fast it may change: nothing to ask."""
 

@@ -85,11 +85,6 @@ class Nodes:
         carriers = (turns @ self.rest[..., None])[..., 0] + transforms[..., 3]
         return Deformed(Skin.apply(means, transforms, self.index, self.weights), carriers, turns)
 
-    def turns(self, frame: int, means: torch.Tensor) -> np.ndarray:
-        """(N, 3, 3) blended turns of the Gaussians, near to rotations."""
-        blended = self.transforms(frame).detach()[..., :3].numpy()[self.index.numpy()]
-        return np.einsum("nk,nkab->nab", self.weights.numpy(), blended)
-
     def roughness(self) -> torch.Tensor:
         """Squared second differences of the knots, of each clip for itself: summed over nodes, mean over time."""
         bend = self.table[self._inner] - 2 * self.table[self._inner + 1] + self.table[self._inner + 2]

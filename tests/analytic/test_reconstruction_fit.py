@@ -80,7 +80,7 @@ def planted(clips: tuple[int, ...] = (FRAMES,), images: int = 60) -> tuple[Captu
 def settings(name: str = "cpu", **changed: object) -> dict:
     """A preset, small enough for a test."""
     conf = yaml.safe_load((CONF / f"{name}.yaml").read_text("utf-8"))
-    conf.pop("kind")
+    del conf["kind"], conf["defaults"]
     small = {"backend": "numba", "iterations": 60, "gaussians": 200, "max_gaussians": 300, "carriers": 24}
     small |= {"hull_cells": 32, "divide_every": 20, "coarsest": 0.5, "depth": 3, "width": 16, "skip": 1, "seed": 3}
     return conf | small | changed
@@ -260,7 +260,9 @@ def test_division_reuses_transparent_gaussians_then_grows():
 
 def test_planted_ball_is_found_again(tmp_path):
     capture, _ = planted()
-    found = fit(capture, **settings(iterations=500, static=0.1, grown=0.4), workspace=Workspace(tmp_path))
+    found = fit(
+        capture, **settings(iterations=500, static=0.1, grown=0.4, rate_deformation=0.02), workspace=Workspace(tmp_path)
+    )
     assert found.history[-1, 2] > 24.0
     assert found.points.shape == (FRAMES, len(found.gaussians.means), 3)
     solid = found.gaussians.opacities > 0.5

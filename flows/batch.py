@@ -97,7 +97,7 @@ def work(experiments: list[Experiment], report: dict) -> tuple[Graph, list[Work]
             continue
         graph = Graph(files)
         planned = [plan(case, graph) for case in experiment.cases]
-        pictures = plan_videos(planned, graph) if report["videos"] else []
+        pictures = plan_videos(planned, graph) if report["figures"] and report["videos"] else []
         pictures += plan_pictures(planned, graph) if report["figures"] else []
         works.append(Work(experiment, graph, planned, pictures, plan_files(planned, graph)))
     return union([w.graph for w in works]), works

@@ -32,12 +32,12 @@ def stages(done: subprocess.CompletedProcess, how: str) -> set[str]:
 def test_table_files_cache_and_change_of_one_setting(user, worm_file):
     first = user(*table3(worm_file))
     report = user.folder / "reports" / "table3"
-    assert "26 of 26 stages computed" in first.stdout
+    assert "27 of 27 stages computed" in first.stdout
     assert stages(first, "cached") == set()
     for name in ("metrics.csv", "table.md", "table.tex", "table.html", "provenance.json"):
         assert (report / name).stat().st_size > 0
     assert "substitute" in (report / "table.md").read_text()
-    assert len(list((report / "figures").iterdir())) == 6
+    assert len(list((report / "figures").iterdir())) == 7
 
     rows = pd.read_csv(report / "metrics.csv", keep_default_na=False)
     assert tuple(rows) == COLUMNS
@@ -61,7 +61,7 @@ def test_table_files_cache_and_change_of_one_setting(user, worm_file):
     assert (report / "metrics.csv").read_bytes() == before
 
     third = user(*table3(worm_file, "animate.k=3"))
-    assert stages(third, "computed") == {"animate", "evaluate", "figures"}
+    assert stages(third, "computed") == {"animate", "evaluate", "figures", "video"}
 
 
 def test_bad_input_is_one_line_and_overwrites_nothing(user, worm_file):
@@ -117,7 +117,7 @@ def test_two_sweeps_at_once_in_one_store(user, worm_file):
     one, two = ((user.folder / "reports" / f"run{i}" / "metrics.csv").read_text() for i in range(2))
     assert one.replace("run0", "run1") == two
     computed = sum(json.loads(line)["seconds"] >= 0 for line in _metas(user))
-    assert computed == 26  # every stage once, whoever got there first
+    assert computed == 27  # every stage once, whoever got there first
 
 
 def _metas(user: Run) -> list[str]:

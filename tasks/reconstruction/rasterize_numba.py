@@ -8,7 +8,7 @@ import torch
 from tasks.errors import InputError
 from tasks.geometry.parallel import for_chunks
 from tasks.reconstruction import splat_blend, splat_project
-from tasks.reconstruction.splat_blend import DEPTH, MOMENTS, SPLAT, TILE
+from tasks.reconstruction.splat_blend import DEPTH, MOMENTS, SPLAT, TILE, X, Y
 
 GAUSSIANS = 16384  # a chunk of them: a thread costs as much as a few thousand
 TILES = 64
@@ -63,8 +63,12 @@ class _Drawing:
             splat_project.project(a, b, means, scales, opacities, sh, quaternions, view, intrinsics, self.size, splats)
 
         for_chunks(project, len(means), GAUSSIANS)
-        self.order = _by_depth(splats[:, DEPTH])
+        near_first = _by_depth(splats[:, DEPTH])
+        self.order = self._by_place(splats, near_first)
         self.splats = splats[self.order]
+        row_of = np.empty(len(means), np.int64)
+        row_of[self.order] = np.arange(len(self.order))
+        near_first = row_of[near_first]
         counts = np.empty(len(self.order), np.int64)
 
         def count(a: int, b: int) -> None:
@@ -72,7 +76,7 @@ class _Drawing:
 
         for_chunks(count, len(counts), GAUSSIANS)
         self.pair_start = np.concatenate([[0], np.cumsum(counts)])
-        pairs = splat_blend.list_pairs(self.splats, self.across, self.down, self.pair_start)
+        pairs = splat_blend.list_pairs(self.splats, near_first, self.across, self.down, self.pair_start)
         self.tile_start, self.splat_of, self.number_of = pairs
         self.tile_end = np.empty(self.across * self.down, np.int64)
         self.images = (
@@ -87,6 +91,15 @@ class _Drawing:
 
         for_chunks(blend, len(self.tile_end), TILES)
         return self.images
+
+    def _by_place(self, splats: np.ndarray, drawn: np.ndarray) -> np.ndarray:
+        """The drawn Gaussians in the order of the tiles that their centres lie in: what a tile needs lies together."""
+        column = np.clip(splats[drawn, X] / TILE, 0, self.across - 1).astype(np.int32)
+        row = np.clip(splats[drawn, Y] / TILE, 0, self.down - 1).astype(np.int32)
+        tile = row * self.across + column
+        if self.across * self.down <= np.iinfo(np.uint16).max:
+            tile = tile.astype(np.uint16)  # which numpy sorts by radix
+        return drawn[np.argsort(tile, kind="stable")]
 
     def backward(self, slopes: tuple[np.ndarray, np.ndarray, np.ndarray]) -> list[np.ndarray | None]:
         """Gradients of means, scales, opacities, sh and quaternions, from those of the three images."""

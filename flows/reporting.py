@@ -301,14 +301,24 @@ def _by_case(rows):
 
 
 def _curve(cases: list[Case], rows, curve: list[str] | None) -> list:
-    """A metric against a key of the config, a line for every dataset."""
-    from tasks.evaluation.charts import curve_chart
+    """A metric against a key of the config: a line for every dataset, or of several methods one chart a dataset."""
+    from tasks.evaluation.charts import curve_chart, methods_chart
     from tasks.values import Picture
 
     if not curve:
         return []
     key, metric = curve
     where = {_variant(c): _at(c.config, key) for c in cases}
+    if rows["method"].nunique() > 1:
+        labels = {c.method: c.config["animate"]["label"] for c in cases}
+        drawn = []
+        for dataset, subject in rows[["dataset", "subject"]].drop_duplicates().itertuples(index=False, name=None):
+            of = {"dataset": dataset, "subject": subject, "where": where, "label": key, "labels": labels}
+            picture = Picture(
+                "curve", f"{subject}: {metric} against {key}", None, methods_chart(rows, metric=metric, **of)
+            )
+            drawn.append((f"{dataset}_{subject}", picture))
+        return drawn
     chart = curve_chart(rows, metric=metric, where=where, label=key)
     return [("all", Picture("curve", f"{metric} against {key}", None, chart))]
 

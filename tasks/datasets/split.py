@@ -14,11 +14,18 @@ from tasks.values import Motion
 SAME = 1e-5  # of the diagonal: two frames whose points all lie this close are the same frame
 MOSTLY = 0.5  # a test clip of which more than this share repeats training frames tests nothing
 LIVELY = 0.5  # of the median clip's movement: below this a clip is not chosen as a test by itself
+STRETCH = 25  # frames of a clip, about a second, below which fewer clips give longer ones
 LANDMARKS = 16  # points compared first when looking for equal frames
 
 
 def split(
-    motion: Motion, *, by: Literal["auto", "clips", "frames"], test: list[str], fraction: float, observed: float
+    motion: Motion,
+    *,
+    by: Literal["auto", "clips", "frames"],
+    test: list[str],
+    fraction: float,
+    observed: float,
+    frames: int | None,
 ) -> tuple[Motion, Motion]:
     """(train, test), each contiguous run of frames a clip of its own, so that no window crosses a cut.
 
@@ -26,6 +33,8 @@ def split(
     by="frames": the last `fraction` of every clip; `test` must be empty.
     by="auto": clips where there are several or some are named, else frames.
     observed: share of the training frames that is kept, from the first on (the paper's fig. 9); the test stays.
+    frames: so many of them are kept in the end, in stretches from the beginnings of clips that lie evenly among all;
+    None keeps all.
 
     Frames at which the test repeats a training frame (clips often start from one neutral pose) are left out of the
     test. Raises InputError when that takes more than half of a test clip (by="frames": of all test frames), when either
@@ -40,7 +49,27 @@ def split(
             raise InputError("split.test", expected="no names when split.by=frames", found=_list(test))
         train, held = _by_frames(motion, fraction)
     test_motion = _without_repeats(train, held, each_clip=by == "clips")
-    return _prefix(train, observed), test_motion
+    return _fewer(_prefix(train, observed), frames), test_motion
+
+
+def _fewer(train: Motion, frames: int | None) -> Motion:
+    """So many training frames, from as many clips as leave each a stretch of at least ``STRETCH``."""
+    if frames is None:
+        return train
+    if not 2 <= frames <= train.frames:
+        expected = f"null, or 2 to the {train.frames} training frames"
+        raise InputError("split.frames", expected=expected, found=str(frames))
+    clips, lengths = train.clips(), np.diff(train.clip_start)
+    for count in range(min(len(clips), max(1, frames // STRETCH)), len(clips) + 1):
+        chosen = np.arange(count) * len(clips) // count
+        if lengths[chosen].sum() >= frames:
+            break
+    longest = next(n for n in range(1, frames + 1) if np.minimum(lengths[chosen], n).sum() >= frames)
+    kept = np.minimum(lengths[chosen], longest)
+    surplus = int(kept.sum()) - frames  # of those that are cut, the last give a frame each
+    kept[np.flatnonzero(kept == longest)[-surplus:] if surplus else []] -= 1
+    pieces = [(slice(clips[c].start, clips[c].start + int(n)), c) for c, n in zip(chosen, kept, strict=True) if n]
+    return train.take_frames([p for p, _ in pieces], [train.clip_names[c] for _, c in pieces])
 
 
 def _prefix(train: Motion, share: float) -> Motion:

@@ -67,5 +67,25 @@ def curve_chart(rows: pd.DataFrame, *, metric: str, where: Mapping[str, float], 
     return plot.lines(series, x=label, y=METRICS[metric].label)
 
 
+def methods_chart(
+    rows: pd.DataFrame,
+    *,
+    metric: str,
+    dataset: str,
+    subject: str,
+    where: Mapping[str, float],
+    label: str,
+    labels: Mapping[str, str],
+) -> str:
+    """A metric of one subject against a setting that the variants differ in, a line for every method; means over seeds.
+    where, label: as for :func:`curve_chart`; labels: what to call methods."""
+    chosen = rows[(rows["metric"] == metric) & (rows["dataset"] == dataset) & (rows["subject"] == subject)]
+    series = []
+    for method, group in chosen.assign(x=chosen["variant"].map(where)).groupby("method", sort=False):
+        mean = group.groupby("x")["value"].mean()
+        series.append(plot.Series(_label(labels, str(method)), mean.index.to_numpy(float), mean.to_numpy()))
+    return plot.lines(series, x=label, y=f"{METRICS[metric].label} [{chosen['unit'].iloc[0]}]", log_x=True)
+
+
 def _label(labels: Mapping[str, str], name: str) -> str:
     return labels.get(name, name.rpartition("/")[2])

@@ -28,7 +28,7 @@ def random_motion(lengths: list[int], sizes: list[float] | None = None, seed: in
 
 def test_named_clips():
     motion = random_motion([5, 6, 7])
-    train, test = split(motion, by="clips", test=["clip1"], fraction=0.5, observed=1.0)
+    train, test = split(motion, by="clips", test=["clip1"], fraction=0.5, observed=1.0, frames=None)
     assert (train.clip_names, test.clip_names) == (("clip0", "clip2"), ("clip1",))
     np.testing.assert_array_equal(test.points, motion.points[5:11])
     np.testing.assert_array_equal(train.points, np.delete(motion.points, np.r_[5:11], axis=0))
@@ -37,7 +37,7 @@ def test_named_clips():
 
 def test_last_frames_of_every_clip():
     motion = random_motion([10, 5])
-    train, test = split(motion, by="frames", test=[], fraction=0.2, observed=1.0)
+    train, test = split(motion, by="frames", test=[], fraction=0.2, observed=1.0, frames=None)
     assert (train.clip_start.tolist(), test.clip_start.tolist()) == ([0, 8, 12], [0, 2, 3])
     np.testing.assert_array_equal(test.points, motion.points[[8, 9, 14]])
 
@@ -52,7 +52,7 @@ def test_no_frame_is_on_both_sides_and_none_is_lost(lengths, by, fraction):
     motion = random_motion(lengths)
     motion.points[:, 0, 0] = np.arange(motion.frames)  # tells the frames apart
     try:
-        train, test = split(motion, by=by, test=[], fraction=fraction, observed=1.0)
+        train, test = split(motion, by=by, test=[], fraction=fraction, observed=1.0, frames=None)
     except InputError:
         return
     sides = [side.points[:, 0, 0].astype(int) for side in (train, test)]
@@ -68,7 +68,7 @@ def test_the_rig_is_split_along():
     rotations = np.tile(np.eye(3, dtype=np.float32), (8, 2, 1, 1))
     shifts = np.arange(8 * 6, dtype=np.float32).reshape(8, 2, 3)
     rig = Rig(("a", "b"), np.array([-1, 0], np.int32), np.zeros((2, 3)), np.ones((12, 2)) / 2, rotations, shifts)
-    train, test = split(replace(motion, rig=rig), by="clips", test=["clip0"], fraction=0.5, observed=1.0)
+    train, test = split(replace(motion, rig=rig), by="clips", test=["clip0"], fraction=0.5, observed=1.0, frames=None)
     np.testing.assert_array_equal(train.rig.translations, shifts[4:])
     np.testing.assert_array_equal(test.rig.translations, shifts[:4])
 
@@ -78,14 +78,14 @@ def test_a_sequence_that_repeats_itself_is_refused():
     motion = Motion("gallop", np.concatenate([once, once]), None, np.array([0, 48]), ("gallop",), 24.0)
     for fraction in (0.2, 0.5, 0.6):
         with pytest.raises(InputError, match="repeat training frames"):
-            split(motion, by="frames", test=[], fraction=fraction, observed=1.0)
+            split(motion, by="frames", test=[], fraction=fraction, observed=1.0, frames=None)
 
 
 def test_single_repeats_are_left_out_of_the_test():
     motion = random_motion([6, 7])
     motion.points[6] = motion.points[0]  # both clips start from one pose
     motion.points[9] = motion.points[3] + 1e-7
-    _, test = split(motion, by="clips", test=["clip1"], fraction=0.5, observed=1.0)
+    _, test = split(motion, by="clips", test=["clip1"], fraction=0.5, observed=1.0, frames=None)
     assert test.clip_names == ("clip1", "clip1 (2)")
     np.testing.assert_array_equal(test.points, motion.points[[7, 8, 10, 11, 12]])
     assert test.clip_start.tolist() == [0, 2, 5]
@@ -95,9 +95,11 @@ def test_a_copied_clip_is_refused_as_a_test_and_never_chosen():
     motion = random_motion([6, 6, 6, 6])
     motion.points[6:12] = motion.points[5::-1]  # clip1 is clip0 backwards
     with pytest.raises(InputError, match=r"clip1, frame 0.*clip0, frame 5"):
-        split(motion, by="clips", test=["clip1"], fraction=0.5, observed=1.0)
+        split(motion, by="clips", test=["clip1"], fraction=0.5, observed=1.0, frames=None)
     assert choose_clips(motion, 4) == [2, 3]
-    split(motion, by="clips", test=["clip0", "clip1"], fraction=0.5, observed=1.0)  # together they are unseen
+    split(
+        motion, by="clips", test=["clip0", "clip1"], fraction=0.5, observed=1.0, frames=None
+    )  # together they are unseen
 
 
 def test_clips_that_barely_move_are_not_chosen():
@@ -135,7 +137,7 @@ def test_liveliness_by_hand():
 )
 def test_impossible_splits(lengths, by, test, fraction, says):
     with pytest.raises(InputError) as caught:
-        split(random_motion(lengths), by=by, test=test, fraction=fraction, observed=1.0)
+        split(random_motion(lengths), by=by, test=test, fraction=fraction, observed=1.0, frames=None)
     assert says in str(caught.value)
 
 
@@ -162,20 +164,34 @@ def test_least_deformed_is_the_frame_in_the_middle_of_a_stretch(faces):
 
 def test_auto_takes_clips_where_there_are_several():
     several, one = random_motion([5, 6, 7]), random_motion([10])
-    assert split(several, by="auto", test=[], fraction=0.3, observed=1.0)[1].clip_names in [
+    assert split(several, by="auto", test=[], fraction=0.3, observed=1.0, frames=None)[1].clip_names in [
         ("clip0",),
         ("clip1",),
         ("clip2",),
     ]
-    assert split(one, by="auto", test=[], fraction=0.2, observed=1.0)[1].frames == 2
+    assert split(one, by="auto", test=[], fraction=0.2, observed=1.0, frames=None)[1].frames == 2
 
 
 def test_observed_keeps_the_first_training_frames_and_the_whole_test():
     motion = random_motion([6, 5, 7])
-    train, test = split(motion, by="clips", test=["clip1"], fraction=0.5, observed=0.6)
+    train, test = split(motion, by="clips", test=["clip1"], fraction=0.5, observed=0.6, frames=None)
     assert train.clip_start.tolist() == [0, 6, 8]
     assert train.clip_names == ("clip0", "clip2")
     np.testing.assert_array_equal(train.points, motion.points[[*range(6), 11, 12]])
     assert test.frames == 5
     with pytest.raises(InputError, match=r"split\.observed"):
-        split(motion, by="clips", test=["clip1"], fraction=0.5, observed=0.0)
+        split(motion, by="clips", test=["clip1"], fraction=0.5, observed=0.0, frames=None)
+
+
+@pytest.mark.parametrize("frames", [2, 24, 60, 61, 99, 130])
+def test_fewer_frames_come_in_stretches_from_clips_far_apart(frames):
+    motion = random_motion([30, 50, 20, 40, 20])
+    train, test = split(motion, by="clips", test=["clip4"], fraction=0.5, observed=1.0, frames=frames)
+    assert train.frames == frames
+    assert test.frames == 20
+    assert min(np.diff(train.clip_start)) >= min(frames, 20)
+    for name, clip in zip(train.clip_names, train.clips(), strict=True):
+        source = motion.clips()[motion.clip_names.index(name)]
+        np.testing.assert_array_equal(train.points[clip], motion.points[source][: clip.stop - clip.start])
+    with pytest.raises(InputError, match=r"split\.frames.*2 to the 140"):
+        split(motion, by="clips", test=["clip4"], fraction=0.5, observed=1.0, frames=141)

@@ -43,7 +43,7 @@ def character(shared_data, name, *, hierarchy="attached"):
 def test_mesh_sequences_load(shared_data, name):
     motion = sequence(shared_data, name)
     assert (*motion.points.shape[:2], len(motion.faces)) == SEQUENCES[name]
-    train, test = split(motion, by="frames", test=[], fraction=0.2, observed=1.0)
+    train, test = split(motion, by="frames", test=[], fraction=0.2, observed=1.0, frames=None)
     assert train.frames + test.frames == motion.frames
     frame = canonical(train, choice="least_deformed").frame
     assert 0 <= frame < train.frames
@@ -57,7 +57,7 @@ def test_the_published_gallop_of_48_files_is_refused(shared_data, tmp_path):
     np.savez(path, vertices=np.concatenate([once.points, once.points]), faces=once.faces)
     motion = mesh_sequence.load(path=str(path), fps=24.0, faces=True, unit="unit")
     with pytest.raises(InputError, match="repeat training frames"):
-        split(motion, by="frames", test=[], fraction=0.2, observed=1.0)
+        split(motion, by="frames", test=[], fraction=0.2, observed=1.0, frames=None)
 
 
 @pytest.mark.parametrize("name", RIGS)
@@ -123,7 +123,7 @@ def test_glb_equals_its_decoded_form(shared_data, name):
 @pytest.mark.parametrize("name", RIGS)
 def test_test_clips_are_chosen_well(shared_data, name):
     motion = character(shared_data, f"decoded/{name}.npz")
-    train, test = split(motion, by="clips", test=[], fraction=0.2, observed=1.0)
+    train, test = split(motion, by="clips", test=[], fraction=0.2, observed=1.0, frames=None)
     held = set(test.clip_names)
     assert held
     assert not held & set(IDLE)

@@ -15,7 +15,7 @@ from tasks.errors import InputError
 from tasks.geometry.measure import diagonal
 from tasks.values import Capture, Files, Motion, Rig
 
-PROBES = 16  # views that the framing is measured on
+PROBES = 40  # views that the framing is measured on
 PROBE_SIZE = 64  # their pixels
 ROUNDS = 6  # of getting nearer to the wanted share
 RING = (8.0, 35.0)  # degrees of elevation of training cameras, by turns

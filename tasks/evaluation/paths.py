@@ -18,13 +18,14 @@ def evaluate_paths(reconstruction: Reconstruction, truth: Motion) -> Metrics:
 
     truth: the true surface, triangles, in the frames of the reconstruction; a point on it is held by its barycentric
     coordinates. The reference time is the frame whose points are nearest to the Gaussians at rest. Only Gaussians with
-    an opacity of 0.5 or more count. Raises ValueError where the truth has other frames or no triangles.
+    an opacity of 0.5 or more count (the most opaque ones where there are none). Raises ValueError where the truth has other frames or no triangles.
     """
     import igl
 
     if truth.faces is None or len(truth.points) != len(reconstruction.points):
         raise ValueError(f"paths of {len(reconstruction.points)} frames need as many of a surface of triangles")
-    seen = reconstruction.gaussians.opacities >= OPAQUE
+    opacities = reconstruction.gaussians.opacities
+    seen = opacities >= min(OPAQUE, float(opacities.max()))
     points, rest = reconstruction.points[:, seen], reconstruction.gaussians.means[seen]
     frame = int(np.argmin([((p.astype(np.float64) - rest) ** 2).sum() for p in points]))
     surface, faces = truth.points[frame].astype(np.float64), truth.faces.astype(np.int64)

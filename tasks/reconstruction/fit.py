@@ -104,6 +104,7 @@ def _check(recipe: dict) -> None:
         ("coarsest", recipe["coarsest"] <= 1, "at most 1"),
         ("max_gaussians", recipe["max_gaussians"] >= recipe["gaussians"], f"at least {recipe['gaussians']}"),
         ("grown", recipe["grown"] >= recipe["static"], f"at least static, {recipe['static']}"),
+        ("backend", recipe["backend"] != "gsplat" or recipe["deformation"] == "mlp", "numba with deformation=nodes"),
         ("deltas", not (recipe["deltas"] and recipe["deformation"] == "nodes"), "false with deformation=nodes"),
     ]
     for name, good, expected in rules:

@@ -20,7 +20,7 @@ from tasks.reconstruction.mlp import Mlp
 from tasks.reconstruction.nodes import Nodes
 from tasks.reconstruction.rasterize import rasterize
 from tasks.reconstruction.rigidity import Neighbourhood
-from tasks.reconstruction.splines import spline
+from tasks.reconstruction.splines import Spline, spline
 from tasks.values import Capture, Gaussians, Reconstruction
 from tasks.workspace import Workspace
 
@@ -219,9 +219,7 @@ class Fitting:
         if recipe.deformation == "nodes":
             self.deformation = Nodes.placed(self._spline(), points, recipe.carriers)
         else:
-            shape = {n: getattr(recipe, n) for n in ("depth", "width", "skip", "deltas")}
-            times = self.capture.times.astype(np.float32)
-            self.deformation = Mlp.placed(times, points, recipe.carriers, recipe.seed, **shape)
+            self.deformation = Mlp.placed(self.capture.times, points, recipe.carriers, recipe.seed, **self._network())
         self._bind()
 
     def _bind(self) -> None:
@@ -229,7 +227,10 @@ class Fitting:
             self.deformation.bind(self.params["means"].detach().cpu().numpy())
             self.neighbours = self.neighbours or Neighbourhood(self.deformation.rest, self.recipe.neighbours)
 
-    def _spline(self):
+    def _network(self) -> dict:
+        return {"device": self.device} | {n: getattr(self.recipe, n) for n in ("depth", "width", "skip", "deltas")}
+
+    def _spline(self) -> Spline:
         spacing = self.recipe.images_per_knot * len(self.capture.times) / len(self.capture.images)
         return spline(np.asarray(self.capture.clip_start), max(1.0, spacing))
 
@@ -333,8 +334,7 @@ class Fitting:
             self.deformation = Nodes(self._spline(), centres, level, params["table"].cpu().numpy())
             self.deformation.index, self.deformation.weights = tensors["index"], tensors["weights"]
         else:
-            shape = {n: getattr(recipe, n) for n in ("depth", "width", "skip", "deltas")}
-            self.deformation = Mlp(self.capture.times, tensors["rest"].numpy(), **shape)
+            self.deformation = Mlp(self.capture.times, tensors["rest"].numpy(), **self._network())
             self.deformation.layers = {n: v for n, v in params.items() if n not in density.NAMES}
         self.neighbours = Neighbourhood(self.deformation.rest, recipe.neighbours)
 

@@ -19,12 +19,14 @@ class Mlp:
     """depth x width perceptron with ReLU, the input joined in again after layer ``skip``.
 
     Outputs of a point: shift (3), rotation vector (3), and with ``deltas`` change of log scale and of opacity logit.
-    carriers: (B, 3) points at rest that rigidity is asked of.
+    carriers: (B, 3) points at rest that rigidity is asked of; device: where all of it lies.
     """
 
-    def __init__(self, times: np.ndarray, carriers: np.ndarray, *, depth: int, width: int, skip: int, deltas: bool):
+    def __init__(
+        self, times: np.ndarray, carriers: np.ndarray, *, depth: int, width: int, skip: int, deltas: bool, device: str
+    ) -> None:
         self.times, self.skip, self.deltas = times.astype(np.float32), skip, deltas
-        self.rest = torch.from_numpy(carriers)
+        self.rest = torch.from_numpy(carriers).to(device)
         self.depth, self.width = depth, width
         self.layers: dict[str, torch.Tensor] = {}
 
@@ -44,8 +46,8 @@ class Mlp:
 
     def _add(self, name: str, inputs: int, outputs: int, bound: float, random: torch.Generator) -> None:
         weight = (2 * torch.rand(outputs, inputs, generator=random) - 1) * bound
-        self.layers[f"{name}.weight"] = weight.requires_grad_()
-        self.layers[f"{name}.bias"] = torch.zeros(outputs, requires_grad=True)
+        self.layers[f"{name}.weight"] = weight.to(self.rest.device).requires_grad_()
+        self.layers[f"{name}.bias"] = torch.zeros(outputs, device=self.rest.device, requires_grad=True)
 
     def bind(self, means: np.ndarray) -> None:
         """Every point is asked for itself: nothing to choose."""
@@ -66,12 +68,11 @@ class Mlp:
 
     def at(self, frame: int, means: torch.Tensor) -> Deformed:
         """Where the Gaussians are in a frame. means: (N, 3) at rest."""
-        rest = self.rest.to(means.device)
-        out = self.out(frame, torch.cat([means, rest]))
+        out = self.out(frame, torch.cat([means, self.rest]))
         own, carried = out[: len(means)], out[len(means) :]
         scales, opacities = (own[:, 6:7], own[:, 7]) if self.deltas else (None, None)
         turns = rotation_of(carried[:, 3:6])
-        return Deformed(means + own[:, :3], rest + carried[:, :3], turns, scales, opacities)
+        return Deformed(means + own[:, :3], self.rest + carried[:, :3], turns, scales, opacities)
 
     def roughness(self) -> torch.Tensor | None:
         """The bands of time bound how fast it may change: nothing to ask."""

@@ -339,6 +339,7 @@ def test_loss_that_is_not_finite_names_term_and_iteration(tmp_path, monkeypatch)
         ({"reference": 99}, "reference"),
         ({"rate_means": 0.0}, "rate_means"),
         ({"deltas": True}, "deltas"),
+        ({"backend": "gsplat"}, "backend"),
     ],
 )
 def test_settings_that_make_no_sense(tmp_path, changed, message):

@@ -18,7 +18,8 @@ def evaluate_paths(reconstruction: Reconstruction, truth: Motion) -> Metrics:
 
     truth: the true surface, triangles, in the frames of the reconstruction; a point on it is held by its barycentric
     coordinates. The reference time is the frame whose points are nearest to the Gaussians at rest. Only Gaussians with
-    an opacity of 0.5 or more count (the most opaque ones where there are none). Raises ValueError where the truth has other frames or no triangles.
+    an opacity of 0.5 or more count (the most opaque ones where there are none).
+    Raises ValueError where the truth has other frames or no triangles.
     """
     import igl
 

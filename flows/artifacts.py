@@ -26,6 +26,7 @@ class Board:
     def __init__(self, name: str, graph: Graph, note: Callable[[str], None]) -> None:
         self._name, self._note = name, note
         self._on = watched()
+        self._lost = False
         self._totals = Counter(node.stage for node in graph.nodes.values())
         self._done: Counter[str] = Counter()
         self._bars: dict[str, Bar] = {}
@@ -40,7 +41,9 @@ class Board:
             self._bars[stage] = Bar(f"{self._name}-progress-{stage}", f"{stage}, {total} to do")
 
     def update(self, node: Node) -> None:
-        """A stage has finished, well or badly."""
+        """A stage has finished, well or badly. Also notices a server that is gone, with or without pages."""
+        if not alive():
+            self._lose()
         self._done[node.stage] += 1
         if self._bars:
             self._post(self._bars[""].move, self._done.total() / self._totals.total())
@@ -78,9 +81,13 @@ class Board:
 
     def _post(self, call: Callable, *arguments: object, **named: object) -> None:
         if self._on and not _posted(call, *arguments, **named):
-            self._on = False
-            self._bars.clear()
+            self._lose()
+
+    def _lose(self) -> None:
+        if not self._lost:
             self._note(LOST)
+        self._on, self._lost = False, True
+        self._bars.clear()
 
 
 class Bar:

@@ -110,12 +110,12 @@ def test_killed_in_mid_stage_and_resumed(user, worm_file):
     assert resumed.read_bytes() == calm.read_bytes()
 
 
-def test_two_sweeps_at_once_in_one_store(user, worm_file):
-    runs = [user.start(*table3(worm_file, f"report.name=run{i}")) for i in range(2)]
+def test_four_sweeps_at_once_in_one_store(user, worm_file):
+    runs = [user.start(*table3(worm_file, f"report.name=run{i}")) for i in range(4)]
     outputs = [run.communicate(timeout=600)[0] for run in runs]
-    assert [run.returncode for run in runs] == [0, 0], outputs
-    one, two = ((user.folder / "reports" / f"run{i}" / "metrics.csv").read_text() for i in range(2))
-    assert one.replace("run0", "run1") == two
+    assert [run.returncode for run in runs] == [0, 0, 0, 0], outputs
+    metrics = [(user.folder / "reports" / f"run{i}" / "metrics.csv").read_text() for i in range(4)]
+    assert len({text.replace(f"run{i}", "run") for i, text in enumerate(metrics)}) == 1
     computed = sum(json.loads(line)["seconds"] >= 0 for line in _metas(user))
     assert computed == 27  # every stage once, whoever got there first
 
@@ -158,6 +158,22 @@ def test_without_a_server_one_is_started_and_ends_with_the_run(tmp_path, worm_fi
             return
         time.sleep(0.2)
     pytest.fail(f"still running after the run was killed: {[children[pid] for pid in alive]}")
+
+
+def test_a_run_outlives_its_own_server(tmp_path, small_file):
+    alone = Run(tmp_path, None)
+    alone.environment.pop("PREFECT_API_URL", None)
+    alone.environment["PREFECT_HOME"] = str(tmp_path / "prefect")
+    run = alone.start(*table3(small_file, "report.figures=false", "sweep.methods=[lbs]"))
+    for line in run.stdout:
+        if " split " in line:
+            break
+    (server,) = (pid for pid, command in _children(run.pid).items() if "flows.server" in command)
+    os.kill(server, signal.SIGKILL)
+    rest = run.communicate(timeout=150)[0]
+    assert run.returncode == 0, rest
+    assert "does not answer" in rest
+    assert (tmp_path / "reports" / "table3" / "metrics.csv").exists()
 
 
 def _children(pid: int) -> dict[int, str]:

@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from tasks.errors import InputError
-from tasks.values import Metrics
+from tasks.values import Animation, Metrics
 from tasks.workspace import Workspace
+
+TOY = "tests.workflow.toy"
 
 
 def _log(log: str, line: str) -> None:
@@ -42,6 +44,18 @@ def slow(source: Metrics, *, seconds: float, log: str) -> Metrics:
     time.sleep(seconds)
     _log(log, "slow ended")
     return source
+
+
+def spread(*, value: float, size: int, log: str) -> Animation:
+    """Many numbers."""
+    _log(log, "spread")
+    return Animation(np.random.default_rng(int(value)).normal(size=(1, size, 3)).astype(np.float32))
+
+
+def bend(source: Animation, *, log: str) -> Animation:
+    """As many others."""
+    _log(log, "bend")
+    return Animation(np.sin(source.points))
 
 
 def defect(source: Metrics, *, log: str) -> Metrics:

@@ -113,6 +113,10 @@ OF_STAGES = {
     "tracing",
     "matching",
 }  # a benchmark's arguments that are whole stages' settings
+DECIDING = {  # what the rest of the schema hangs on, beside the pipeline
+    **dict.fromkeys(("dataset", "bones", "skeleton", "reconstruction", "runner"), "kind"),
+    "animate": "function",
+}
 RENAMED = {"lambda_": "lambda"}  # Python keywords that are the field's names in the config
 
 
@@ -132,7 +136,9 @@ def animate_function(function: str) -> str:
 
 
 def schema(config: dict, sweep: dict[str, object]) -> dict[str, object]:
-    """The type of every key that this config may have, nested as the config is. sweep: those of the grid."""
+    """The type of every key that this config may have, nested as the config is. sweep: those of the grid. Raises
+    InputError where a value that decides over others is wrong itself."""
+    _check_deciding(config)
     dataset = config["dataset"]
     pipeline = config["pipeline"]
     skeleton: dict[str, object] = {"kind": Literal["curve", "given"]}
@@ -177,6 +183,25 @@ def schema(config: dict, sweep: dict[str, object]) -> dict[str, object]:
         "runner": RUNNER | ({"address": str | None} if config["runner"].get("kind") in CLUSTERS else {}),
         "sweep": sweep,
     }
+
+
+def _check_deciding(config: dict) -> None:
+    _typed(config["pipeline"], str, "pipeline")
+    groups = {group: config[group] for group in DECIDING}
+    if config["pipeline"] == "make_garments":
+        groups["make"] = config["make"]
+    for group, node in groups.items():
+        _check_group(node, group)
+        if DECIDING.get(group) in node:
+            _typed(node[DECIDING[group]], str, f"{group}.{DECIDING[group]}")
+    for name in ("cut", "clips"):
+        if "make" in groups:
+            _check_group(groups["make"].get(name), f"make.{name}")
+
+
+def _check_group(node: object, where: str) -> None:
+    if not isinstance(node, dict):
+        raise InputError(where, expected="a group of settings", found=repr(node))
 
 
 def _images(config: dict) -> dict[str, object]:

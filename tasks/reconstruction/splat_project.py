@@ -25,6 +25,7 @@ from tasks.reconstruction.splat_blend import (
     Y,
 )
 
+SH_0 = 0.28209479177387814
 SLACK = 1e-3  # pixels and share that an extent is widened by, so that rounding cuts nothing off
 
 
@@ -174,7 +175,7 @@ def sh_basis(unit, count, out):
     """The first `count` real spherical harmonics of a direction."""
     real = unit.dtype.type
     x, y, z = unit[0], unit[1], unit[2]
-    out[0] = real(0.28209479177387814)
+    out[0] = real(SH_0)
     if count > 1:
         c = real(0.4886025119029199)
         out[1], out[2], out[3] = -c * y, c * z, -c * x
@@ -245,7 +246,7 @@ def project_backward(
     """
     real = means.dtype.type
     of_means, of_scales, of_opacities, of_sh, of_quaternions = gradients
-    total, shift = np.empty(MOMENTS, means.dtype), np.empty(3, means.dtype)
+    total, shift = np.empty(MOMENTS, means.dtype), np.zeros(3, means.dtype)
     basis, basis_slope = np.empty(16, means.dtype), np.empty((16, 3), means.dtype)
     unit, centre = np.empty(3, means.dtype), camera_centre(view)
     for row in range(first, last):
@@ -270,7 +271,12 @@ def project_backward(
         gx = -(s[A] * total[5] + s[B] * total[6]) * intrinsics[0, 0] / z
         gy = -(s[B] * total[5] + s[C] * total[6]) * intrinsics[1, 1] / z
         dz -= gx * x / z + gy * y / z
-        back_shade(means[i], centre, sh[i], s, total, unit, basis, basis_slope, of_sh[i], shift)
+        for k in range(3):
+            if s[RED + k] <= real(0.0):
+                total[k] = real(0.0)  # held at zero
+            of_sh[i, 0, k] = real(SH_0) * total[k]
+        if sh.shape[1] > 1:  # else the direction does not matter, and the call would cost more than all the rest
+            back_shade(means[i], centre, sh[i], total, unit, basis, basis_slope, of_sh[i], shift)
         for k in range(3):
             of_means[i, k] = (dx + gx) * view[0, k] + (dy + gy) * view[1, k] + dz * view[2, k] + shift[k]
 
@@ -343,27 +349,21 @@ def back_quaternion(q, g, out):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def back_shade(mean, centre, sh, splat, total, unit, basis, basis_slope, of_sh, of_mean):
-    """Gradients by the coefficients and, through the direction, by the mean."""
+def back_shade(mean, centre, sh, total, unit, basis, basis_slope, of_sh, of_mean):
+    """Gradients by the coefficients and, through the direction, by the mean. total: gradient by the colour."""
     real = mean.dtype.type
     count = len(sh)
     distance = direction(mean, centre, unit)
     sh_basis(unit, count, basis)
-    of_mean[:] = real(0.0)
-    for k in range(3):
-        if splat[RED + k] <= real(0.0):
-            continue
-        for j in range(count):
-            of_sh[j, k] = basis[j] * total[k]
-    if count == 1:
-        return
     sh_slope(unit, count, basis_slope)
-    for k in range(3):
-        if splat[RED + k] <= real(0.0):
-            continue
-        for j in range(1, count):
-            for axis in range(3):
-                of_mean[axis] += basis_slope[j, axis] * sh[j, k] * total[k]
+    of_mean[:] = real(0.0)
+    for j in range(1, count):
+        along = real(0.0)
+        for k in range(3):
+            of_sh[j, k] = basis[j] * total[k]
+            along += sh[j, k] * total[k]
+        for axis in range(3):
+            of_mean[axis] += basis_slope[j, axis] * along
     along = of_mean[0] * unit[0] + of_mean[1] * unit[1] + of_mean[2] * unit[2]
     for axis in range(3):
         of_mean[axis] = (of_mean[axis] - unit[axis] * along) / distance

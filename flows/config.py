@@ -54,9 +54,11 @@ class Case:
 
     @property
     def absent(self) -> bool:
-        """Its file is not there, and the experiment does without it then."""
+        """Its file is neither there nor in the repository, and the experiment does without it then."""
         path = self.config["dataset"].get("path")
-        return self.config["sweep"]["absent"] == "skip" and bool(path) and not Path(path).expanduser().exists()
+        if self.config["sweep"]["absent"] != "skip" or not path:
+            return False
+        return not any((folder / Path(path).expanduser()).exists() for folder in (Path.cwd(), ROOT))
 
     @property
     def data(self) -> str:

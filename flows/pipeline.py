@@ -227,7 +227,7 @@ def _sources(planned: list[Planned], graph: Graph) -> list[Output]:
     found = []
     for data, case in lead.items():
         inputs = {n: case.nodes[n] for n in ("confidence", "test", "train")}
-        name = re.sub(r"[^A-Za-z0-9.-]+", "_", data)
+        name = _file_name(data)
         function = "tasks.evaluation.confidence:confidence_file"
         node = graph.add("confidence", function, {"name": name}, outputs=("files",), case=data, **inputs)
         found.append(node["files"])

@@ -6,7 +6,7 @@ import pytest
 
 from flows import config
 from flows.graph import Graph, Node
-from flows.pipeline import Planned, plan
+from flows.pipeline import Planned, plan, plan_files
 from tasks.errors import InputError
 
 TABLE4 = ["+experiment=table4", "sweep.datasets=[scene_figure]"]
@@ -73,3 +73,27 @@ def test_captures_go_down_the_same_stages():
     assert ("gaussians", "reconstruction") in behind(nodes["skinning"][0])
     (case,) = config.expand([*words, "sweep.methods=[gaussians]"])
     assert [node.stage for node in plan(case, Graph()).metrics] == ["evaluate"]
+
+
+def exported(overrides: list[str]) -> list[Node]:
+    graph = Graph()
+    files = plan_files([plan(case, graph) for case in config.expand(overrides)], graph)
+    return [node for node, _ in files if node.stage == "export"]
+
+
+def test_gaussians_are_exported_as_they_are_posed_and_only_where_there_are_some():
+    (node,) = exported([*TABLE4, "sweep.methods=[partmm]", "export.formats=[ply]"])
+    assert node.inputs["reconstruction"][0].stage == "pose"
+    (node,) = exported(["+experiment=table2", "sweep.datasets=[scene_animal]", "export.formats=[splat]"])
+    assert node.inputs["reconstruction"][0].stage == "gaussians"
+    with pytest.raises(InputError, match=r"export.formats.*ply: no reconstruction.*reconstruction=cpu"):
+        exported(["sweep.datasets=[creature_animal]", "sweep.methods=[lbs]", "export.formats=[ply]"])
+    with pytest.raises(InputError, match=r"export.formats.*glb: no canonical"):
+        exported(["+experiment=table2", "sweep.datasets=[scene_animal]", "export.formats=[glb]"])
+
+
+def test_scenes_are_made_of_the_whole_motion_and_are_those_of_table2():
+    made = planned(["+experiment=make_scenes", "sweep.datasets=[scene_animal]"])["raycast"]
+    fitted = planned(["+experiment=table2", "sweep.datasets=[scene_animal]"])["gaussians"]
+    assert made.nodes["views"][0].id == fitted.nodes["views"][0].id
+    assert not {stage for stage, _ in behind(made.nodes["scene_files"][0])} & {"split", "gaussians"}

@@ -24,12 +24,14 @@ PANELS = 4  # methods or variants side by side in the picture of errors
 
 @dataclass(frozen=True)
 class Planned:
-    """A case in the graph: the nodes whose artefacts the report reads."""
+    """A case in the graph: the nodes whose artefacts the report reads. beside: metrics with a row of their own, by its
+    name."""
 
     case: Case
     name: str
     metrics: tuple[Node, ...]
     nodes: dict[str, Output] = field(default_factory=dict)
+    beside: dict[str, Node] = field(default_factory=dict)
 
 
 def plan(case: Case, graph: Graph) -> Planned:
@@ -69,7 +71,7 @@ def plan(case: Case, graph: Graph) -> Planned:
         metrics += _left_out(case, add, nodes)
     if config["pipeline"] == "drive":
         nodes |= _driven(config, add, nodes)
-    return Planned(case, name, tuple(metrics), nodes)
+    return Planned(case, name, tuple(metrics), nodes, _other_joints(config, add, nodes))
 
 
 def _driven(config: dict, add, nodes: dict[str, Output]) -> dict[str, Output]:
@@ -206,6 +208,22 @@ def _skeleton(settings: dict, add, train, test, canonical, skinning) -> dict[str
 
     poses = {"poses": fit(train, "seen"), "query": fit(test, "unseen")}
     return {"surface": surface, "curve": curve, "skeleton": skeleton} | poses
+
+
+def _other_joints(config: dict, add, nodes: dict[str, Output]) -> dict[str, Node]:
+    """The other way to joints, held against the true rig where there is one: every report shows both."""
+    skeleton = config["skeleton"]
+    if skeleton["kind"] == "given":
+        return {}
+    (way,) = [name for name in schema.JOINTS if name != skeleton["joints"]]
+    settings = dict(skeleton[way])
+    if way == "gradient":
+        settings["refits"] = 0  # they fit its weights, which nobody asks for, and leave the joints where they are
+    inputs = {n: nodes[n] for n in ("train", "canonical", "skinning", "surface", "curve")}
+    found = add("skeleton", schema.JOINTS[way], settings, "skeleton", f"skeleton by {way}", **inputs)["skeleton"]
+    inputs = {"train": nodes["train"], "canonical": nodes["canonical"], "skeleton": found}
+    measured = add("evaluate", schema.EVALUATE_JOINTS, config["evaluate"], "metrics", **inputs)
+    return {f"by {way}": measured}
 
 
 def plan_files(planned: list[Planned], graph: Graph) -> list[Output]:

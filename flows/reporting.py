@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 from flows.config import CONF, NO_ABLATION, Case
 from flows.pipeline import Planned
 from flows.provenance import provenance
+from flows.schema import JOINTS
 from flows.store import Ref, Store
 
 if TYPE_CHECKING:
@@ -67,6 +68,7 @@ BENCHMARKS = {
 }
 SCENES = ("images_count", "views_count", "frames_count", "fill_pct", "on_subject_pct")
 CLOTH = ("deep_pct", "depth_995", "strain_p99_pct", "speed_max", "frames_count")
+OTHER_WAYS = tuple(f"by {way}" for way in JOINTS)  # ends of the rows' names that show the other way to joints
 TRUTH = ("joint_f1", "joint_f1_fine", "link_f1", "j2j_pct", "j2b_pct", "b2b_pct")
 
 
@@ -142,8 +144,15 @@ def _rows(case: Planned, refs: dict[str, Ref], store: Store):
         "variant": _variant(case.case),
         "seed": case.case.seed,
     }
-    found = [refs[node.id] for node in case.metrics]
-    return join([rows_of(store.load(ref, "metrics"), key=ref.key, **labels) for ref in found])
+
+    def rows(node, **other) -> pd.DataFrame:
+        ref = refs[node.id]
+        return rows_of(store.load(ref, "metrics"), key=ref.key, **(labels | other))
+
+    beside = [
+        rows(node, variant=", ".join(filter(None, [labels["variant"], name]))) for name, node in case.beside.items()
+    ]
+    return join([*(rows(node) for node in case.metrics), *(found for found in beside if len(found))])
 
 
 def tables_of(cases: list[Case], rows, remarks: list[str], said: list[str]) -> list:
@@ -201,9 +210,14 @@ def tables_of(cases: list[Case], rows, remarks: list[str], said: list[str]) -> l
     shared = common | {"labels": common["labels"] | {cases[-1].method: "all methods"}, "baselines": []}
     rig_notes = ["Errors on the training frames that bones and skeleton were fitted to.", *remarks]
     if rows["metric"].isin(RIG).any():
-        tables.append(build(lead, title="Bones and skeleton", metrics=RIG, notes=rig_notes, **shared))
+        main = lead[~lead["variant"].str.endswith(OTHER_WAYS)]
+        tables.append(build(main, title="Bones and skeleton", metrics=RIG, notes=rig_notes, **shared))
     if rows["metric"].isin(TRUTH).any():
-        tables.append(build(with_means(lead), title="Joints against the true rig", metrics=TRUTH, notes=[], **shared))
+        note = "Rows 'by …' take the other way to joints on the same bones and curve: by motion, or by the "
+        note += "gradient of the weights along the curve (the paper's eq. 5)."
+        notes = [note] if lead["variant"].str.endswith(OTHER_WAYS).any() else []
+        title = "Joints against the true rig"
+        tables.append(build(with_means(lead), title=title, metrics=TRUTH, notes=notes, **shared))
     return tables
 
 

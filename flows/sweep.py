@@ -126,7 +126,8 @@ def _written(works: list[Work], outcome: Outcome, store: Store) -> list[Report]:
     for one in works:
         done, missing = [], list(one.experiment.missing)
         for planned in one.planned:
-            errors = [outcome.errors[n.id] for m in planned.metrics for n in m.walk() if n.id in outcome.errors]
+            measured = [*planned.metrics, *planned.beside.values()]
+            errors = [outcome.errors[n.id] for m in measured for n in m.walk() if n.id in outcome.errors]
             if errors:
                 why = str(errors[0]) if isinstance(errors[0], InputError) else f"failed: {errors[0]!r}"
                 missing.append(Missing(planned.name, why, planned.case.config["dataset"]["stands_for"]))

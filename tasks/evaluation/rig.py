@@ -46,17 +46,22 @@ def evaluate_rig(
         "skeleton_rmse_pct": 100.0 * skeleton_rmse / diagonal,
         "joints_count": float(len(skeleton.parents)),
     }
-    if train.rig is not None and train.rig.names != skeleton.names:
-        found |= _against_truth(train.rig, canonical, skeleton, diagonal, turn)
-    return declared(found, train.unit)
+    return declared(found | _against_truth(train, canonical, skeleton, turn), train.unit)
 
 
-def _against_truth(
-    rig: Rig, canonical: Canonical, skeleton: Skeleton, diagonal: float, turn: float
-) -> dict[str, float]:
-    true_joints, true_parents = counting_joints(at_canonical(rig, canonical), turn)
+def evaluate_joints(train: Motion, canonical: Canonical, skeleton: Skeleton, *, turn: float) -> Metrics:
+    """The joints alone against the true rig, and their count; nothing where the data has no rig. turn: as above."""
+    found = _against_truth(train, canonical, skeleton, turn)
+    return declared(found | ({"joints_count": float(len(skeleton.parents))} if found else {}), train.unit)
+
+
+def _against_truth(train: Motion, canonical: Canonical, skeleton: Skeleton, turn: float) -> dict[str, float]:
+    if train.rig is None or train.rig.names == skeleton.names:
+        return {}
+    true_joints, true_parents = counting_joints(at_canonical(train.rig, canonical), turn)
     if len(true_joints) == 0:
         return {}
+    diagonal = measure.diagonal(canonical.points)
     scores = joint_scores(skeleton.joints, skeleton.parents, true_joints, true_parents, diagonal)
     return {name: scores[short] for short, name in _NAMED.items()}
 

@@ -32,7 +32,7 @@ def stages(done: subprocess.CompletedProcess, how: str) -> set[str]:
 def test_table_files_cache_and_change_of_one_setting(user, worm_file):
     first = user(*table3(worm_file))
     report = user.folder / "reports" / "table3"
-    assert "27 of 27 stages computed" in first.stdout
+    assert "36 of 36 stages computed" in first.stdout
     assert stages(first, "cached") == set()
     for name in ("metrics.csv", "table.md", "table.tex", "table.html", "provenance.json"):
         assert (report / name).stat().st_size > 0

@@ -167,10 +167,15 @@ def _confidence(config: dict, add, nodes: dict[str, Output]) -> dict[str, Output
 
 
 def _left_out(case: Case, add, nodes: dict[str, Output]) -> list[Node]:
-    """The method again without one training clip, in turn: on the unseen clips and on the one left out."""
+    """The method again without one training clip, in turn: on the unseen clips and on the one left out. Of several
+    seeds, the first."""
     config = case.config
     runs, of = config["evaluate"]["left_out"], config["evaluate"]["left_out_of"]
-    if runs == 0 or (of is not None and case.dataset not in of):
+    if (
+        runs == 0
+        or (of is not None and case.dataset not in of)
+        or case.seed != (config["sweep"]["seeds"] or [case.seed])[0]
+    ):
         return []
     scores = {}
     for run in range(runs):

@@ -82,6 +82,9 @@ def batch(overrides: list[str], multirun: bool = False) -> Batch:
         cases, absent = _present(config.expand_some(own, multirun, used, missing))
         title = cases[0].config["report"]["title"] if cases else config.whole(own[:1])["report"]["title"]
         experiments.append(Experiment(name, title, (*flags, *own), cases, list(dict.fromkeys([*missing, *absent]))))
+    if not any(experiment.cases for experiment in experiments):
+        name, why = names[0], experiments[0].missing[0].why
+        raise InputError("sweep.experiments", expected="data for one of them at least", found=f"none; {name}: {why}")
     config.check_used(kept, used, [case for experiment in experiments for case in experiment.cases])
     return Batch(whole, experiments, True)
 

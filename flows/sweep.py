@@ -68,6 +68,8 @@ def _flow(batch: Batch, graph: Graph, works: list[Work], show: bool):
 
     @flow(name=config["report"]["name"], task_runner=task_runner(config["runner"]), validate_parameters=False)
     def sweep(experiment: str, cases: int) -> None:
+        from rich.text import Text
+
         from flows.shelf import index_batch
 
         progress = Progress(graph, show)  # made here, since Prefect pickles the flow's closure for worker processes
@@ -81,8 +83,10 @@ def _flow(batch: Batch, graph: Graph, works: list[Work], show: bool):
         for report in [r for r in reports if r.folder]:
             board.publish(report.folder, report.markdown)
         if batch.index:
+            if not any(report.folder for report in reports):
+                raise_first(graph, outcome)
             place = index_batch(batch, reports)
-            progress.finish([report.line for report in reports], place, len(outcome.computed))
+            progress.finish([Text(report.line) for report in reports], place, len(outcome.computed))
             raise_first(graph, outcome, pardoned=InputError)
             written.append(place)
             return
@@ -126,8 +130,8 @@ def _written(works: list[Work], outcome: Outcome, store: Store) -> list[Report]:
     for one in works:
         done, missing = [], list(one.experiment.missing)
         for planned in one.planned:
-            measured = [*planned.metrics, *planned.beside.values()]
-            errors = [outcome.errors[n.id] for m in measured for n in m.walk() if n.id in outcome.errors]
+            heads = [*planned.metrics, *planned.beside.values(), planned.nodes["about"][0]]
+            errors = [outcome.errors[n.id] for head in heads for n in head.walk() if n.id in outcome.errors]
             if errors:
                 why = str(errors[0]) if isinstance(errors[0], InputError) else f"failed: {errors[0]!r}"
                 missing.append(Missing(planned.name, why, planned.case.config["dataset"]["stands_for"]))

@@ -5,29 +5,30 @@ from __future__ import annotations
 import pytest
 
 from flows.batch import batch, work
-from flows.config import groups
+from flows.config import groups, whole
 from tasks.errors import InputError
 
+LBS = "sweep.methods=[lbs]"
 TWO = "sweep.experiments=[ablation_matching,table3_garments]"
 
 
 def test_every_experiment_keeps_its_own_cases_and_report():
-    whole = batch(["+experiment=paper", TWO, "seed=3"])
+    found = batch(["+experiment=paper", TWO, "seed=3", LBS])
     alone = {
-        name: batch([f"+experiment={name}", "seed=3"]).experiments[0]
+        name: batch([f"+experiment={name}", "seed=3", LBS]).experiments[0]
         for name in ("ablation_matching", "table3_garments")
     }
-    assert whole.index
-    assert whole.config["report"]["name"] == "paper"
-    for experiment in whole.experiments:
+    assert found.index
+    assert found.config["report"]["name"] == "paper"
+    for experiment in found.experiments:
         assert experiment.cases == alone[experiment.name].cases
-        assert experiment.arguments == (f"+experiment={experiment.name}", "seed=3")
+        assert experiment.arguments == (f"+experiment={experiment.name}", "seed=3", LBS)
         assert {c.config["seed"] for c in experiment.cases} == {3}
 
 
 def test_equal_stages_of_two_experiments_are_one():
-    whole = batch(["+experiment=paper", TWO])
-    graph, works = work(whole.experiments, {"figures": True, "videos": True})
+    found = batch(["+experiment=paper", TWO])
+    graph, works = work(found.experiments, {"figures": True, "videos": True})
     single = [len(w.graph.nodes) for w in works]
     assert max(single) < len(graph.nodes) < sum(single)
     bones = [n for n in graph.nodes.values() if n.stage == "bones"]
@@ -38,18 +39,15 @@ def test_equal_stages_of_two_experiments_are_one():
 
 
 def test_the_paper_names_experiments_that_exist():
-    names = [e.name for e in batch(["+experiment=paper"]).experiments]
+    names = whole(["+experiment=paper"])["sweep"]["experiments"]
     assert set(names) <= set(groups()["experiment"])
     assert len(set(names)) == len(names)
 
 
 def test_data_that_is_not_given_is_left_out_with_the_reason():
-    overrides = ["+experiment=paper", "sweep.experiments=[table3,quick]", "dataset=mesh_sequence"]
-    for experiment in batch(overrides).experiments:
-        assert experiment.cases == []
-        assert experiment.not_run == [("mesh_sequence", experiment.missing[0].why)]
-        assert "add dataset.path=… to the command" in experiment.missing[0].why
-    full = batch(["+experiment=paper", "sweep.experiments=[table3_full]", "data_root=nowhere"]).experiments[0]
+    with pytest.raises(InputError, match=r"data for one of them at least.*add dataset.path=… to the command"):
+        batch(["+experiment=paper", "sweep.experiments=[table3,quick]", "dataset=mesh_sequence"])
+    full = batch(["+experiment=paper", "sweep.experiments=[table3_full]", "data_root=nowhere", LBS]).experiments[0]
     assert {c.dataset for c in full.cases} == {"garments_tshirt", "garments_dress"}
     assert (
         "deer, fox, horse, husky, trex, triceratops, human_samba, human_crane",

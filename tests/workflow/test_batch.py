@@ -8,21 +8,21 @@ from flows.batch import batch, work
 from flows.config import groups, whole
 from tasks.errors import InputError
 
-LBS = "sweep.methods=[lbs]"
+ONE = "sweep.methods=[partmm]"
 TWO = "sweep.experiments=[ablation_matching,table3_garments]"
 
 
 def test_every_experiment_keeps_its_own_cases_and_report():
-    found = batch(["+experiment=paper", TWO, "seed=3", LBS])
+    found = batch(["+experiment=paper", TWO, "seed=3", ONE])
     alone = {
-        name: batch([f"+experiment={name}", "seed=3", LBS]).experiments[0]
+        name: batch([f"+experiment={name}", "seed=3", ONE]).experiments[0]
         for name in ("ablation_matching", "table3_garments")
     }
     assert found.index
     assert found.config["report"]["name"] == "paper"
     for experiment in found.experiments:
         assert experiment.cases == alone[experiment.name].cases
-        assert experiment.arguments == (f"+experiment={experiment.name}", "seed=3", LBS)
+        assert experiment.arguments == (f"+experiment={experiment.name}", "seed=3", ONE)
         assert {c.config["seed"] for c in experiment.cases} == {3}
 
 
@@ -47,7 +47,7 @@ def test_the_paper_names_experiments_that_exist():
 def test_data_that_is_not_given_is_left_out_with_the_reason():
     with pytest.raises(InputError, match=r"data for one of them at least.*add dataset.path=… to the command"):
         batch(["+experiment=paper", "sweep.experiments=[table3,quick]", "dataset=mesh_sequence"])
-    full = batch(["+experiment=paper", "sweep.experiments=[table3_full]", "data_root=nowhere", LBS]).experiments[0]
+    full = batch(["+experiment=paper", "sweep.experiments=[table3_full]", "data_root=nowhere", ONE]).experiments[0]
     assert {c.dataset for c in full.cases} == {"garments_tshirt", "garments_dress"}
     assert (
         "deer, fox, horse, husky, trex, triceratops, human_samba, human_crane",

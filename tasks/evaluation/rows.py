@@ -38,7 +38,8 @@ def rows_of(
 
 def join(pieces: list[pd.DataFrame]) -> pd.DataFrame:
     """The rows of several cases in the order given; an empty frame of the right columns for none."""
-    return pd.concat(pieces, ignore_index=True) if pieces else pd.DataFrame(columns=list(COLUMNS))
+    some = [piece for piece in pieces if len(piece)]  # an empty one would turn the seeds into floats
+    return pd.concat(some, ignore_index=True) if some else pd.DataFrame(columns=list(COLUMNS))
 
 
 def with_means(rows: pd.DataFrame) -> pd.DataFrame:

@@ -16,7 +16,7 @@ from tasks.errors import InputError
 from tasks.evaluation import typeset
 from tasks.evaluation.metrics import METRICS
 from tasks.evaluation.paper import paper_of
-from tasks.evaluation.rows import join, rows_of, with_means
+from tasks.evaluation.rows import join, rows_of, to_csv, with_means
 from tasks.evaluation.tables import Cell, Table, build, digits_for, ranks
 from tasks.values import Metrics
 
@@ -291,3 +291,9 @@ def test_means_are_of_what_every_subject_has():
     means = found[found["dataset"] == "mean"]
     assert means[["method", "value"]].values.tolist() == [["ours", 25.0]]
     assert with_means(rows[rows["subject"] == "a"])["dataset"].eq("d").all()
+
+
+def test_a_case_without_numbers_leaves_the_others_as_they_are():
+    nothing = row("lbs", 1.0).iloc[:0].astype({"seed": float})
+    made = to_csv(join([row("lbs", 1.5), nothing]))
+    assert made == to_csv(row("lbs", 1.5))

@@ -9,7 +9,7 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 from tasks.errors import InputError
-from tasks.geometry import kinematics
+from tasks.geometry import kinematics, rigid
 from tasks.geometry.measure import vertex_rmse
 from tasks.geometry.rotations import from_rotation_vector
 from tasks.geometry.skinning import skin
@@ -17,7 +17,7 @@ from tasks.geometry.sparse_weights import fit_weights
 from tasks.skeleton.articulation import centres
 from tasks.skeleton.inner_bones import Bones, prune
 from tasks.skeleton.joints_gradient import joints_by_gradient
-from tasks.skeleton.joints_motion import joints_by_motion, keep_inside
+from tasks.skeleton.joints_motion import Articulation, _root, joints_by_motion, keep_inside
 from tasks.skeleton.poses import fit_poses
 from tasks.values import Curve, Skinning
 from tests.analytic.jointed_shapes import Bending, ball_joint
@@ -197,3 +197,15 @@ def test_pruning_keeps_small_bones_that_turn_and_drops_large_ones_that_do_not():
     kept = prune(bones, 4.0, knee=1.7, angle=6.0, at_most=10)
     assert kept.count == 3
     assert kept.error() < 1e-3
+
+
+def test_the_root_is_the_calm_bone_of_the_trunk_not_the_largest_nor_a_calm_leaf():
+    """Bones 0 and 1, two limbs on each, and a large head 6 on the one that turns."""
+    links = np.array([[0, 1], [0, 2], [0, 3], [1, 4], [1, 5], [1, 6]])
+    turn = np.array([0.1, 0.3, 0.5, 0.5, 0.5, 0.0, 0.2])  # amplitudes; limb 5 is the calmest of all
+    swing = turn[None] * np.sin(np.linspace(0.0, 6.0, 50))[:, None]
+    transforms = rigid.make(from_rotation_vector(swing[..., None] * [0.0, 0.0, 1.0]), np.zeros((50, 7, 3)))
+    bones = Bones(np.zeros((1, 3)), np.zeros((50, 1, 3), np.float32), np.ones((1, 7)), transforms, 4)
+    areas = np.array([2.0, 2.5, 1.0, 1.0, 1.0, 1.0, 6.0])
+    found = Articulation(bones, links, np.zeros((6, 3)), np.zeros(6), np.ones(6), np.zeros((7, 3)), areas)
+    assert _root(found) == 0

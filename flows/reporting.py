@@ -29,7 +29,7 @@ CONFIDENCE = ("confidence_spearman", "outside_pct")
 LEFT_OUT = ("rmse_spread", "rmse_left_out", "rmse_left_out_spread")
 VIEWS = ("psnr", "ssim", "flip", "lpips", "ssim_down")
 PATHS = ("path_pct", "path_start_pct")
-RIG = ("bones_rmse_pct", "bones_count", "skeleton_rmse_pct", "joints_count")
+RIG = ("bones_rmse_pct", "bones_count", "bone_fragments", "skeleton_rmse_pct", "joints_count")
 # of each benchmark: what decides, then the numbers behind it by the titles of their tables
 BENCHMARKS = {
     "benchmark_bones": (

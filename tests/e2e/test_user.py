@@ -38,7 +38,7 @@ def test_table_files_cache_and_change_of_one_setting(user, worm_file):
     for name in ("metrics.csv", "table.md", "table.tex", "table.html", "provenance.json"):
         assert (report / name).stat().st_size > 0
     assert "substitute" in (report / "table.md").read_text()
-    assert len(list((report / "figures").iterdir())) == 7
+    assert len(list((report / "figures").iterdir())) == 8
 
     rows = pd.read_csv(report / "metrics.csv", keep_default_na=False)
     assert tuple(rows) == COLUMNS

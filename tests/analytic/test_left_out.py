@@ -92,5 +92,5 @@ def test_gains_are_of_means_over_seeds_and_printed_ones_of_printed_numbers():
     assert found["value"].tolist() == pytest.approx([20.0])
     cells = [PaperCell(3, m, "vto", "dress", "rmse", v, "mm", r) for m, v, r in (("a", 36.7, "clear"),
              ("b", 52.2, "clear"), ("c", None, "lost"))]  # fmt: skip
-    made = printed_gains(Paper("p", {}, {}, tuple(cells)), 3, "a").cells
+    made = printed_gains(Paper("p", {}, {}, {}, tuple(cells)), 3, "a").cells
     assert [(c.method, c.value) for c in made] == [("b", 29.7), ("c", None)]

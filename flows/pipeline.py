@@ -14,7 +14,7 @@ from flows.config import NO_ABLATION, Case
 from flows.garments import plan_garment, plan_manifest
 from flows.graph import Graph, Node
 from flows.intake import Output
-from flows.source import signature
+from flows.source import FILES, signature
 from tasks.driving.drive import existing
 from tasks.errors import InputError
 
@@ -42,7 +42,7 @@ def plan(case: Case, graph: Graph) -> Planned:
 
     def add(stage: str, function: str, node: dict, outputs: str, title: str | None = None, **inputs: object) -> Node:
         settings = schema.arguments(function, node, case.seed if stage == "animate" else config["seed"])
-        path = settings.get("path") if stage in ("dataset", "drive") else None
+        path = next((settings[n] for n in FILES if settings.get(n)), None)
         about = {"outputs": tuple(outputs.split()), "case": name, "path": path, "title": title}
         return graph.add(stage, function, settings, **about, **inputs)
 

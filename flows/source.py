@@ -12,6 +12,7 @@ from tasks.errors import InputError
 
 ROOT = Path(__file__).resolve().parent.parent
 WORKSPACE = "workspace"  # a keyword that is no setting: see tasks.workspace
+FILES = ("path", "lpips")  # settings that name an input file, whose bytes count and not its place
 _TYPES = {
     "int": int,
     "float": float,

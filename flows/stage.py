@@ -19,7 +19,7 @@ from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
 
-from flows.source import WORKSPACE
+from flows.source import FILES, WORKSPACE
 from flows.store import Ref, Store, canonical_json, explained
 from tasks.values import Training
 from tasks.workspace import Workspace
@@ -56,7 +56,7 @@ def key_of(job: Job) -> str:
     """The cache key of a job."""
     settings = {n: _canonical(v) for n, v in job.settings.items()}
     if job.files:  # the files' bytes stand for their place; the name is kept, it becomes the subject's
-        settings["path"] = Path(str(job.settings["path"])).name
+        settings |= {n: Path(str(settings[n])).name for n in FILES if settings.get(n)}
     content = {
         "format": FORMAT,
         "stage": job.stage,

@@ -97,3 +97,16 @@ def test_scenes_are_made_of_the_whole_motion_and_are_those_of_table2():
     fitted = planned(["+experiment=table2", "sweep.datasets=[scene_animal]"])["gaussians"]
     assert made.nodes["views"][0].id == fitted.nodes["views"][0].id
     assert not {stage for stage, _ in behind(made.nodes["scene_files"][0])} & {"split", "gaussians"}
+
+
+def test_weights_of_lpips_count_by_their_bytes(tmp_path):
+    weights = tmp_path / "lpips.npz"
+    identities = set()
+    for content in (b"one", b"two"):
+        weights.write_bytes(content)
+        (case,) = config.expand(
+            ["dataset=scene_figure", "sweep.datasets=null", "sweep.methods=[gaussians]", f"views.lpips={weights}"]
+        )
+        views = plan(case, Graph()).metrics[0]
+        identities.add(views.files)
+    assert len(identities) == 2

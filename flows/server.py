@@ -28,6 +28,7 @@ def quiet_prefect() -> None:
         "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
         "DO_NOT_TRACK": "1",
         "PREFECT_LOGGING_HANDLERS_CONSOLE_LEVEL": "CRITICAL",  # our own display says what happens
+        "PREFECT_LOGGING_INTERNAL_LEVEL": "CRITICAL",  # nor pages about events that a stopped server did not take
     }
     for name, value in defaults.items():
         os.environ.setdefault(name, value)

@@ -32,7 +32,7 @@ ADDED = ("experiment", "ablation")  # groups that the config does not choose fro
 ALONE = "again"  # the report of a case that is run again by itself
 SWEPT = ("datasets", "methods", "ablations")  # the axes of an experiment's grid
 SWEEP = dict.fromkeys(("experiments", *SWEPT), list[str] | None)
-SWEEP |= {"seeds": list[int] | None, "absent": Literal["fail", "skip"]}
+SWEEP |= {"seeds": list[int] | None, "seeds_of": list[str] | None, "absent": Literal["fail", "skip"]}
 
 
 @dataclass(frozen=True)
@@ -168,18 +168,20 @@ def _sweep(
             missing.append(Missing(name, str(error), config["dataset"].get("stands_for")))
             continue
         kept = [o for o in values if o.input_line in set_here]
-        for node, seed in itertools.product(nodes, _seeds(config)):
+        for node, seed in itertools.product(nodes, _seeds(config, name)):
             alone = _alone(chosen, ablation, kept, node.get("path"), seed)
             filled = config | {"dataset": node, "method_seed": seed}
             yield Case(name, config["animate"]["name"], variant, filled, alone)
 
 
-def _seeds(config: dict) -> list[int | None]:
-    """The seeds that the method is run with: the experiment's, but for a method without randomness one is enough."""
-    seeds, function = config["sweep"]["seeds"], config["animate"].get("function")
+def _seeds(config: dict, dataset: str) -> list[int | None]:
+    """The seeds that the method is run with: the experiment's, of which one is enough for a method without randomness
+    and for a dataset that they are not meant for."""
+    seeds, function, of = config["sweep"]["seeds"], config["animate"].get("function"), config["sweep"]["seeds_of"]
     if not seeds or config["method_seed"] is not None or function is None:
         return [config["method_seed"]]
-    return seeds if "seed" in signature(schema.animate_function(function))[1] else seeds[:1]
+    several = "seed" in signature(schema.animate_function(function))[1] and (of is None or dataset in of)
+    return seeds if several else seeds[:1]
 
 
 def _alone(

@@ -131,6 +131,13 @@ def test_wildcards_are_one_case_a_file(tmp_path):
 def test_seeds_are_for_methods_with_randomness():
     cases = config.expand(["sweep.datasets=null", "sweep.methods=[lbs,mlp]", "sweep.seeds=[3,4]"])
     assert [(c.method, c.seed, c.config["seed"]) for c in cases] == [("lbs", 3, 0), ("mlp", 3, 0), ("mlp", 4, 0)]
+    some = ["sweep.datasets=[creature_animal,creature_figure]", "sweep.methods=[mlp]", "sweep.seeds=[3,4]"]
+    cases = config.expand([*some, "sweep.seeds_of=[creature_figure]"])
+    assert [(c.dataset, c.seed) for c in cases] == [
+        ("creature_animal", 3),
+        ("creature_figure", 3),
+        ("creature_figure", 4),
+    ]
     fixed = config.expand(["sweep.datasets=null", "sweep.methods=[mlp]", "sweep.seeds=[3,4]", "method_seed=7"])
     assert [c.seed for c in fixed] == [7]
     plain = config.expand(["sweep.datasets=null", "sweep.methods=[mlp]", "seed=5"])

@@ -372,7 +372,7 @@ def labels_of(cases: list[Case]) -> dict[str, str]:
 
 def _notes(cases: list[Case], settings: dict) -> list[str]:
     notes = []
-    if any(c.config["skeleton"]["kind"] == "curve" for c in cases):
+    if any(c.config["pipeline"] == "animate" and c.config["skeleton"]["kind"] == "curve" for c in cases):
         notes.append(
             "Query poses of unseen clips come from inverse kinematics on the unseen geometry, "
             "as the paper does where the data brings no skeleton."

@@ -111,4 +111,6 @@ def test_committed_tables_are_what_their_numbers_make(folder):
     again = made_again(folder)
     assert {"metrics.csv", "table.md", "table.tex", "table.html"} <= set(again)
     for name, data in again.items():
+        if name == "table.html" and not (folder / name).exists():
+            continue  # not committed: it holds every figure again, as reports/index.html does
         assert (folder / name).read_bytes() == data, f"{folder.name}/{name} is not what metrics.csv makes"

@@ -10,8 +10,6 @@ import numpy as np
 from tasks.errors import InputError
 from tasks.geometry.rotations import from_rotation_vector
 
-MOST = 10**8  # numbers of motion: more would not fit
-
 
 @dataclass(frozen=True)
 class Driver:

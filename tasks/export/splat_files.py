@@ -13,7 +13,6 @@ import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -63,14 +62,6 @@ def gaussians_ply(reconstruction: Reconstruction, *, name: str) -> Files:
 def gaussians_splat(reconstruction: Reconstruction, *, name: str) -> Files:
     """The canonical Gaussians and those of every frame as .splat files; see :func:`reconstruction_files`."""
     return Files.of({f"{FOLDER}/{name}/{path}": data for path, data in reconstruction_files(reconstruction, "splat")})
-
-
-def export_reconstruction(reconstruction: Reconstruction, folder: Path, *, format: Literal["ply", "splat"]) -> None:
-    """Writes :func:`reconstruction_files` below a folder."""
-    for path, data in reconstruction_files(reconstruction, format):
-        file = folder / path
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_bytes(data)
 
 
 def reconstruction_files(reconstruction: Reconstruction, format: str) -> Iterator[tuple[str, bytes]]:

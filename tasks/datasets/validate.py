@@ -22,6 +22,7 @@ from tasks.values import About, Motion, Rig
 LEAST_POINTS = 4  # three points and a frame of reference: below this no rigid transform is defined
 RIG_NOTED = 1e-3  # of the diagonal
 STILL = 1e-6  # of the diagonal: float32 cannot hold a motion smaller than this
+COARSE = 1e-3  # of the diagonal: a step between neighbouring float32 numbers that would show
 # what numpy and zipfile raise for damaged, encrypted or foreign archives (NotImplementedError is a RuntimeError)
 UNREADABLE = (ValueError, EOFError, OSError, KeyError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error)
 
@@ -92,13 +93,15 @@ def motion(
 ) -> Motion:
     """A Motion whose every field has been checked. where: the file, for messages. Without clips it is one clip.
 
-    Raises InputError for wrong shapes and types, NaN or infinite coordinates, faces out of range, malformed clips,
-    fewer than two frames or four points, and a sequence that does not move.
+    Raises InputError for wrong shapes and types, NaN or infinite coordinates, a shape so far from the origin that
+    float32 loses it, faces out of range, malformed clips, fewer than two frames or four points, and a sequence that
+    does not move.
     """
     points = real(f"{where}: vertices", points, shape="(frames, points, 3)", last=3)
     _check(len(points) >= 2, f"{where}: vertices", "at least 2 frames", len(points), "give a moving sequence")
     _check(points.shape[1] >= LEAST_POINTS, f"{where}: vertices", f"at least {LEAST_POINTS} points", points.shape[1])
     _finite(f"{where}: vertices", points)
+    _resolved(f"{where}: vertices", points)
     if faces is not None:
         faces = triangles(f"{where}: faces", faces, points.shape[1])
     start, names = clips(where, clip_start, clip_names, frames=len(points), only=name)
@@ -258,6 +261,18 @@ def _finite(where: str, points: np.ndarray) -> None:
             expected="finite numbers",
             found=f"{points[bad[0], vertex].tolist()} at frame {bad[0]}, vertex {vertex} ({len(bad)} such frames)",
             do="repair or leave out these frames",
+        )
+
+
+def _resolved(where: str, points: np.ndarray) -> None:
+    """Far from the origin, neighbouring float32 numbers lie farther apart than the shape's details."""
+    farthest = float(np.abs(points[0]).max())
+    if np.spacing(np.float32(farthest)) > COARSE * max(diagonal(points[0]), diagonal(points[-1])) > 0:
+        raise InputError(
+            where,
+            expected="a shape near the origin",
+            found=f"coordinates up to {farthest:.3g} of a shape {diagonal(points[0]):.3g} across, too far for float32",
+            do="subtract the centre of the first frame from all frames",
         )
 
 

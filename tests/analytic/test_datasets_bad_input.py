@@ -75,6 +75,7 @@ BAD_ARRAYS = {
     "text": ({"vertices": np.full((5, 8, 3), "1.0")}, ("real numbers", "<U3")),
     "complex": ({"vertices": moving_cube() * 1j}, ("real numbers", "complex")),
     "pickled": ({"vertices": np.array([CUBE, None], dtype=object)}, ("vertices", "pickled", "never loaded")),
+    "far from the origin": ({"vertices": moving_cube() + 1e6}, ("origin", "1e+06", "subtract the centre")),
     "still": ({"vertices": np.repeat(CUBE[None], 5, 0)}, ("moving", "5 frames")),
     "all in one place": ({"vertices": np.zeros((5, 8, 3)) + np.arange(5)[:, None, None]}, ("one place",)),
     "face out of range": ({"faces": np.vstack([FACES, [[0, 1, 8]]])}, ("0 to 7", "[0, 1, 8]", "face 12")),

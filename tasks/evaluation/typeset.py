@@ -165,11 +165,14 @@ def _grid(title: str, rows: tuple[str, ...], columns: list[Column], footnotes: l
     from rich.table import Table as Grid
     from rich.text import Text
 
-    grid = Grid(title=Text(title, "italic"), title_justify="left")
+    kinds = {data_text(column) for column in columns}
+    same = f" ({kinds.pop()})" if len(kinds) == 1 else ""
+    grid = Grid(title=Text(title + same, "italic"), title_justify="left")
     grid.add_column("method", no_wrap=True)
     for column in columns:
         heading = [column.group] if column.group != title else []
-        grid.add_column(Text("\n".join([*heading, column.label, data_text(column)])), justify="right")
+        data = [] if same else [data_text(column)]
+        grid.add_column(Text("\n".join([*heading, column.label, *data])), justify="right")
     for r, label in enumerate(rows):
         cells = [column.cells[r] for column in columns]
         if all(cell.value is None and not cell.note for cell in cells):

@@ -94,8 +94,7 @@ def split(part: Trajectories, labels: np.ndarray, ceiling: int, rounds: int, flo
     near = cKDTree(place).query(place, k=min(_SEED_POINTS, len(labels)))[1].reshape(len(labels), -1)
     most, stalled = 0, 0
     while stalled < _PATIENCE:
-        bones = weights.forms(part, _fit(part, labels)[2])
-        found, error = weights.nearest_bone(part, bones)
+        found, error = weights.nearest_bone(part, _fit(part, labels)[2])
         count = int(labels.max()) + 1
         if count >= ceiling or part.alignment.scale * np.sqrt(error.mean()) <= floor:
             break
@@ -130,12 +129,12 @@ def _seeds(part: Trajectories, labels: np.ndarray, error: np.ndarray, near: np.n
 def _reassign(part: Trajectories, labels: np.ndarray, rounds: int) -> np.ndarray:
     """Rounds of fitting rigid motions and giving each point to the one that explains it best."""
     for _ in range(rounds):
-        bones = weights.forms(part, _fit(part, labels)[2])
-        found = weights.nearest_bone(part, bones)[0]
+        offsets = _fit(part, labels)[2]
+        found = weights.nearest_bone(part, offsets)[0]
         small = np.bincount(found, minlength=int(labels.max()) + 1) < _LEAST
         if small[found].any() and not small.all():
             kept = np.nonzero(~small)[0]
-            found = weights.nearest_bone(part, weights.forms(part, _fit(part, labels)[2][kept]))[0]
+            found = weights.nearest_bone(part, offsets[kept])[0]
         labels = _compact(found)
     return labels
 
@@ -186,8 +185,8 @@ def _pair_costs(k: np.ndarray, y: np.ndarray, gain: np.ndarray, a: int, others: 
 def _all_points(paths: Trajectories, part: Trajectories, labels: np.ndarray, sound: np.ndarray) -> np.ndarray:
     """Labels of all points, (N,) int32, by the clusters of the sample; each holds a point that is to be trusted."""
     offsets = _fit(part, labels)[2]
-    found = weights.nearest_bone(paths, weights.forms(paths, offsets))[0]
+    found = weights.nearest_bone(paths, offsets)[0]
     kept = np.unique(found[sound])
     if len(kept) < len(offsets):
-        found = weights.nearest_bone(paths, weights.forms(paths, offsets[kept]))[0]
+        found = weights.nearest_bone(paths, offsets[kept])[0]
     return found

@@ -242,7 +242,7 @@ def _remove(part: Trajectories, bones: _Bones, wanted: int) -> None:
     bones.value[bones.index < 0] = 0.0
     lost = bones.value.sum(1) < 1e-6
     if lost.any():
-        nearest = weights.nearest_bone(part, weights.forms(part, bones.offsets))[0]
+        nearest = weights.nearest_bone(part, bones.offsets)[0]
         bones.index[lost], bones.value[lost] = -1, 0.0
         bones.index[lost, 0], bones.value[lost, 0] = nearest[lost], 1.0
     bones.value /= bones.value.sum(1, keepdims=True)

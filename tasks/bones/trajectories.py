@@ -73,9 +73,17 @@ class Trajectories:
         return len(self.basis) // 3
 
     @cached_property
+    def lengths(self) -> np.ndarray:
+        """|u|^2 of each point that is left after compression, (N,)."""
+        each = for_chunks(
+            lambda a, b: np.sum(np.square(self.path[a:b], dtype=np.float64), axis=1), len(self.path), 4096
+        )
+        return np.concatenate([np.zeros(0), *each])
+
+    @cached_property
     def squared(self) -> float:
         """Sum of |u|^2 that is left after compression."""
-        return sum(for_chunks(lambda a, b: float(np.sum(self.path[a:b].astype(np.float64) ** 2)), len(self.path), 4096))
+        return float(np.sum(self.lengths))
 
     def rmse(self, objective: float) -> float:
         """Sum of squared differences among coefficients -> vertex RMSE in the unit of the data.

@@ -23,37 +23,57 @@ from tasks.geometry.parallel import for_chunks
 _POINTS = 512  # points a thread takes at a time
 _TILE = 8  # points whose correlations with all bones are computed together
 _RIDGE = 1e-9  # relative to the mean diagonal: keeps the solve of two bones that move alike from dividing by zero
+_PAIRS = [(i, j) for i in range(4) for j in range(i, 4)]  # the upper triangle, row by row
 _GAIN = 1e-4  # relative gain below which an exchange is not worth its solve
 
 
 @dataclass(frozen=True)
 class Forms:
-    """What the bones contribute to Q, for all points. linear: (P, 4 B), <D_b h, u> = sum_ip h_i linear[p, i B + b]
-    path_p; square: (B, 10, B), h^T D_b^T D_c h = sum_k square[b, k, c] (h h^T)_k, upper triangle row by row."""
+    """What the bones contribute to Q, for all points.
 
+    rows: (B, 4, P), <D_b h, u> = sum_ip h_i rows[b, i, p] path_p, a mean over frames like all that follows; linear:
+    (P, 4 B), the same laid out for all bones at once, column i B + b; square: (B, 10, B), h^T D_b^T D_c h =
+    sum_k square[b, k, c] (h h^T)_k, upper triangle row by row.
+    """
+
+    rows: np.ndarray
     linear: np.ndarray
     square: np.ndarray
 
 
 def forms(paths: Trajectories, offsets: np.ndarray) -> Forms:
-    """offsets: (B, 4, 3, F). Errors are means over frames from here on."""
+    """offsets: (B, 4, 3, F)."""
     count = len(offsets)
-    rows = offsets.reshape(count * 4, -1)
-    linear = product(rows, paths.basis).reshape(count, 4, -1).transpose(2, 1, 0) / paths.frames
-    gram = product(rows, rows.T).reshape(count, 4, count, 4) / paths.frames
+    flat = offsets.reshape(count * 4, -1)
+    gram = product(flat, flat.T).reshape(count, 4, count, 4) / paths.frames
     square = np.empty((count, 10, count))
-    pairs = [(i, j) for i in range(4) for j in range(i, 4)]
-    for k, (i, j) in enumerate(pairs):
+    for k, (i, j) in enumerate(_PAIRS):
         square[:, k] = gram[:, i, :, j] if i == j else gram[:, i, :, j] + gram[:, j, :, i]
-    return Forms(np.ascontiguousarray(linear).reshape(linear.shape[0], -1), square)
+    rows = _rows(paths, offsets)
+    return Forms(rows, _side_by_side(rows), square)
 
 
-def nearest_bone(paths: Trajectories, bones: Forms) -> tuple[np.ndarray, np.ndarray]:
-    """The one bone that explains each point best: (N,) int32, and its squared error, (N,) mean over frames."""
+def _rows(paths: Trajectories, offsets: np.ndarray) -> np.ndarray:
+    flat = offsets.reshape(len(offsets) * 4, -1)
+    return product(flat, paths.basis).reshape(len(offsets), 4, -1) / paths.frames
+
+
+def _side_by_side(rows: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(rows.transpose(2, 1, 0)).reshape(rows.shape[2], -1)
+
+
+def nearest_bone(paths: Trajectories, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The one bone that explains each point best: (N,) int32, and its squared error, (N,) mean over frames.
+
+    offsets: (B, 4, 3, F).
+    """
     label, error = np.empty(len(paths.rest), np.int32), np.empty(len(paths.rest))
+    linear, own = _side_by_side(_rows(paths, offsets)), np.empty((10, len(offsets)))
+    for k, (i, j) in enumerate(_PAIRS):
+        own[k] = (1 if i == j else 2) * np.sum(offsets[:, i] * offsets[:, j], axis=(1, 2)) / paths.frames
 
     def work(start: int, stop: int) -> None:
-        _nearest_bone(paths.rest, paths.path, paths.frames, bones.linear, bones.square, label, error, start, stop)
+        _nearest_bone(paths.rest, paths.path, paths.lengths, paths.frames, linear, own, label, error, start, stop)
 
     for_chunks(work, len(label), _POINTS)
     return label, error
@@ -85,7 +105,9 @@ def exchange(
         _exchange(
             paths.rest,
             paths.path,
+            paths.lengths,
             paths.frames,
+            bones.rows,
             bones.linear,
             bones.square,
             index,
@@ -113,15 +135,16 @@ def losses(paths: Trajectories, bones: Forms, index: np.ndarray, value: np.ndarr
     loss = np.empty(index.shape)
 
     def work(start: int, stop: int) -> None:
-        _losses(paths.rest, paths.path, paths.frames, bones.linear, bones.square, index, value, loss, start, stop)
+        length, frames = paths.lengths, paths.frames
+        _losses(paths.rest, paths.path, length, frames, bones.linear, bones.square, index, value, loss, start, stop)
 
     for_chunks(work, len(index), _POINTS)
     return np.bincount(np.maximum(index, 0).ravel(), loss.ravel(), minlength=len(bones.square))
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _correlate(rest, path, frames, linear, low, high, raw, correlation, energy):
-    """correlation[n, b] = <D_b h_n, u_n> and energy[n] = |u_n|^2, means over frames, for the points low..high."""
+def _correlate(rest, path, linear, low, high, raw, correlation):
+    """correlation[n - low, b] = <D_b h_n, u_n>, mean over frames, for the points low..high and all bones."""
     columns = linear.shape[1]
     count = columns // 4
     width = path.shape[1]
@@ -129,22 +152,32 @@ def _correlate(rest, path, frames, linear, low, high, raw, correlation, energy):
     for n in range(low, high):
         row = raw[n - low]
         row[:] = 0.0
-        total = 0.0
         for p in range(0, whole, 4):
             a0, a1 = np.float64(path[n, p]), np.float64(path[n, p + 1])
             a2, a3 = np.float64(path[n, p + 2]), np.float64(path[n, p + 3])
-            total += a0 * a0 + a1 * a1 + a2 * a2 + a3 * a3
             for j in range(columns):
                 row[j] += a0 * linear[p, j] + a1 * linear[p + 1, j] + a2 * linear[p + 2, j] + a3 * linear[p + 3, j]
         for p in range(whole, width):
             a0 = np.float64(path[n, p])
-            total += a0 * a0
             for j in range(columns):
                 row[j] += a0 * linear[p, j]
-        energy[n - low] = total / frames
         h0, h1, h2 = rest[n, 0], rest[n, 1], rest[n, 2]
         for b in range(count):
             correlation[n - low, b] = h0 * row[b] + h1 * row[count + b] + h2 * row[2 * count + b] + row[3 * count + b]
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _correlate_few(h, path, rows, bones, correlation):
+    """correlation[b] = <D_b h, u> of one point for the given bones; zero for all others."""
+    correlation[:] = 0.0
+    for b in bones:
+        if b < 0:
+            continue
+        r0, r1, r2, r3 = rows[b, 0], rows[b, 1], rows[b, 2], rows[b, 3]
+        total = 0.0
+        for p in range(len(path)):
+            total += path[p] * (h[0] * r0[p] + h[1] * r1[p] + h[2] * r2[p] + h[3] * r3[p])
+        correlation[b] = total
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
@@ -158,20 +191,19 @@ def _products_of(h, out):
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _nearest_bone(rest, path, frames, linear, square, label, error, start, stop):
-    count = len(square)
-    raw, correlation = np.empty((_TILE, 4 * count)), np.empty((_TILE, count))
-    energy, hh = np.empty(_TILE), np.empty(10)
+def _nearest_bone(rest, path, length, frames, linear, own, label, error, start, stop):
+    count = own.shape[1]
+    raw, correlation, hh = np.empty((_TILE, 4 * count)), np.empty((_TILE, count)), np.empty(10)
     for low in range(start, stop, _TILE):
         high = min(low + _TILE, stop)
-        _correlate(rest, path, frames, linear, low, high, raw, correlation, energy)
+        _correlate(rest, path, linear, low, high, raw, correlation)
         for n in range(low, high):
             _products_of(rest[n], hh)
             best, least = 0, np.inf
             for b in range(count):
-                total = energy[n - low] - 2.0 * correlation[n - low, b]
+                total = length[n] / frames - 2.0 * correlation[n - low, b]
                 for k in range(10):
-                    total += hh[k] * square[b, k, b]
+                    total += hh[k] * own[k, b]
                 if total < least:
                     best, least = b, total
             label[n], error[n] = best, max(least, 0.0)
@@ -181,7 +213,9 @@ def _nearest_bone(rest, path, frames, linear, square, label, error, start, stop)
 def _exchange(
     rest,
     path,
+    length,
     frames,
+    rows,
     linear,
     square,
     index,
@@ -198,7 +232,7 @@ def _exchange(
 ):
     count, slots = len(square), index.shape[1]
     raw, correlation = np.empty((_TILE, 4 * count)), np.empty((_TILE, count))
-    energy, hh = np.empty(_TILE), np.empty(10)
+    hh = np.empty(10)
     diagonal, reach = np.empty((10, count)), np.empty(count)
     for b in range(count):
         for k in range(10):
@@ -207,9 +241,12 @@ def _exchange(
     q = np.empty((slots + 1, slots + 1))
     for low in range(start, stop, _TILE):
         high = min(low + _TILE, stop)
-        _correlate(rest, path, frames, linear, low, high, raw, correlation, energy)
+        if rounds > 0:
+            _correlate(rest, path, linear, low, high, raw, correlation)
         for n in range(low, high):
-            c, e = correlation[n - low], energy[n - low]
+            c, e = correlation[n - low], length[n] / frames
+            if rounds == 0:
+                _correlate_few(rest[n], path[n], rows, index[n], c)
             _products_of(rest[n], hh)
             if smoothness > 0.0:
                 _pull(n, graph, last, smoothness, c)
@@ -239,10 +276,10 @@ def _exchange(
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _losses(rest, path, frames, linear, square, index, value, loss, start, stop):
+def _losses(rest, path, length, frames, linear, square, index, value, loss, start, stop):
     count, slots = len(square), index.shape[1]
     raw, correlation = np.empty((_TILE, 4 * count)), np.empty((_TILE, count))
-    energy, hh = np.empty(_TILE), np.empty(10)
+    hh = np.empty(10)
     diagonal, reach = np.empty((10, count)), np.empty(count)
     for b in range(count):
         for k in range(10):
@@ -251,9 +288,9 @@ def _losses(rest, path, frames, linear, square, index, value, loss, start, stop)
     q = np.empty((slots + 1, slots + 1))
     for low in range(start, stop, _TILE):
         high = min(low + _TILE, stop)
-        _correlate(rest, path, frames, linear, low, high, raw, correlation, energy)
+        _correlate(rest, path, linear, low, high, raw, correlation)
         for n in range(low, high):
-            c, e = correlation[n - low], energy[n - low]
+            c, e = correlation[n - low], length[n] / frames
             _products_of(rest[n], hh)
             whole = -1.0
             for out in range(-1, slots):

@@ -60,7 +60,7 @@ def test_weights_on_a_given_support(case: tuple[Trajectories, np.ndarray, np.nda
 def test_exchange_against_trying_all_supports(case: tuple[Trajectories, np.ndarray, np.ndarray]) -> None:
     paths, offsets, u = case
     a = moved(paths, offsets)
-    label, _ = weights.nearest_bone(paths, weights.forms(paths, offsets))
+    label, _ = weights.nearest_bone(paths, offsets)
     np.testing.assert_array_equal(label, np.sum((a - u[:, None]) ** 2, axis=2).argmin(1))
     index = np.full((40, 2), -1, np.int32)
     index[:, 0] = label

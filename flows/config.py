@@ -6,6 +6,7 @@ config answers at once, before torch or Prefect are imported.
 
 from __future__ import annotations
 
+import copy
 import itertools
 import re
 from collections.abc import Iterator
@@ -15,10 +16,16 @@ from glob import glob, has_magic
 from pathlib import Path
 from typing import Literal
 
-from hydra import compose, initialize_config_dir
+from hydra import version
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.config_repository import CachingConfigRepository, ConfigRepository
+from hydra._internal.defaults_list import create_defaults_list
+from hydra._internal.utils import create_config_search_path
+from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
+from hydra.plugins.config_source import ConfigResult
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -288,15 +295,57 @@ def _check_choices(group: str, choice: str, valid: list[str]) -> None:
 
 @cache
 def _compose(overrides: tuple[str, ...]) -> DictConfig:
+    """The config of some choices of groups. Ablations that choose no groups themselves come last in Hydra's order, so
+    they are merged into what the rest composes to: a grid of many ablations composes once."""
     known = groups()
     for text in overrides:  # the choices of an experiment's own grid are checked here, the user's were before
         group, _, choice = text.lstrip("+").partition("=")
         _check_choices(group, choice, known[group])
+    *rest, last = overrides or ("",)
+    ablations = last.partition("=")[2].strip("[]").split(",") if last.startswith("+ablation=") else []
+    files = [CONF / "ablation" / f"{name.strip()}.yaml" for name in ablations]
     try:
-        with initialize_config_dir(str(CONF), version_base="1.3"):
-            return compose("config", list(overrides))
+        if files and all(map(_only_values, files)):
+            return OmegaConf.unsafe_merge(_compose(tuple(rest)).copy(), *map(OmegaConf.load, files))
+        return _by_hydra(overrides)
     except (HydraException, OmegaConfBaseException) as error:
         raise InputError("config", expected="a config that composes", found=_first_line(error)) from None
+
+
+@cache
+def _only_values(file: Path) -> bool:
+    """Whether a config file only sets values, at the places that it spells out."""
+    text = file.read_text("utf-8")
+    return text.startswith("# @package _global_\n") and not re.search(r"^defaults:", text, re.MULTILINE)
+
+
+def _by_hydra(overrides: tuple[str, ...]) -> DictConfig:
+    """As ``hydra.compose`` does it, but files are read once for all compositions and Hydra's own settings, which nobody
+    reads here, stay out: a third of the time."""
+    loader, read = _loader()
+    parsed, files = OverridesParser.create().parse_overrides(list(overrides)), CachingConfigRepository(read)
+    found = create_defaults_list(files, "config", parsed, prepend_hydra=False, skip_missing=False)
+    return loader._compose_config_from_defaults_list(found.defaults, files)
+
+
+class _ReadOnce(ConfigRepository):
+    """Config files, each read from the disk once; a copy is handed out, since Hydra writes into what it gets."""
+
+    def __init__(self, search_path: ConfigSearchPath) -> None:
+        super().__init__(search_path)
+        self._read: dict[str, ConfigResult | None] = {}
+
+    def load_config(self, config_path: str) -> ConfigResult | None:
+        if config_path not in self._read:
+            self._read[config_path] = super().load_config(config_path)
+        return copy.deepcopy(self._read[config_path])
+
+
+@cache
+def _loader() -> tuple[ConfigLoaderImpl, ConfigRepository]:
+    version.setbase("1.3")
+    places = create_config_search_path(str(CONF))
+    return ConfigLoaderImpl(places), _ReadOnce(places)
 
 
 def _plain(config: DictConfig) -> dict:

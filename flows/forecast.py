@@ -7,42 +7,35 @@ from __future__ import annotations
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import median
 
 from rich.console import Console
 from rich.table import Table
 
-from flows.batch import Batch, work
+from flows.batch import Batch, Work, work
+from flows.costs import Cost, Past, makespan
 from flows.graph import Graph, Node, short
 from flows.stage import key_of
-from flows.store import Artefact, Ref, Store
+from flows.store import Ref, Store
 from flows.sweep import job_of
-
-
-@dataclass(frozen=True)
-class Cost:
-    """seconds: of computing; peak_mb: of the process meanwhile; size: bytes in the store."""
-
-    seconds: float
-    peak_mb: float
-    size: float
 
 
 @dataclass(frozen=True)
 class Forecast:
     """A stage before a run. cached: it is in the store; keyed: its inputs are, so that this is certain: behind a stage
-    that is to compute it can still turn out to be cached; cost: what is expected, or None where no past tells."""
+    that is to compute it can still turn out to be cached; cost: what is expected, or None where no past tells;
+    seconds: of computing it, a rough guess where no past tells, 0 where it is cached."""
 
     node: Node
     cached: bool
     keyed: bool
     cost: Cost | None
+    seconds: float
 
 
 def forecast(graph: Graph, config: dict) -> list[Forecast]:
     """The graph's stages in their order."""
     store = Store(config["store"]["path"], create=False)
-    past = store.artefacts()
+    past = Past(store)
     refs: dict[str, Ref] = {}
     found = []
     for node in graph.nodes.values():
@@ -50,51 +43,37 @@ def forecast(graph: Graph, config: dict) -> list[Forecast]:
         ref = store.find(node.stage, key_of(job_of(node, refs, config, None))) if keyed else None
         if ref:
             refs[node.id] = ref
-        found.append(Forecast(node, ref is not None, keyed, None if ref else expected(node, past)))
+            found.append(Forecast(node, True, True, None, 0.0))
+        else:
+            found.append(Forecast(node, False, keyed, past.cost(node), past.seconds(node)))
     return found
 
 
-def expected(node: Node, past: list[Artefact]) -> Cost | None:
-    """The median cost of the same function in the past: on the same data with the same settings, else on the same data,
-    else on any."""
-    same = [a for a in past if a.function == node.function]
-    data = {case.split()[0] for case in node.cases}
-    near = [a for a in same if a.case.split()[:1] and a.case.split()[0] in data]
-    nearest = [a for a in near if a.settings == node.settings]
-    chosen = nearest or near or same
-    if not chosen:
-        return None
-    return Cost(
-        seconds=median(a.seconds for a in chosen),
-        peak_mb=median(a.peak_mb for a in chosen),
-        size=median(a.size for a in chosen),
-    )
+def seconds_with(graph: Graph, forecasts: list[Forecast], workers: int) -> float:
+    """How long the run will take with so many workers, as it starts its stages."""
+    return makespan(graph, {f.node.id: f.seconds for f in forecasts}, workers)
 
 
-def critical_path(forecasts: list[Forecast]) -> float:
-    """Seconds of the longest chain of stages to compute: no number of workers makes it shorter."""
-    until: dict[str, float] = {}
-    for f in forecasts:
-        own = f.cost.seconds if f.cost else 0.0
-        until[f.node.id] = own + max((until[u.id] for u in f.node.upstream()), default=0.0)
-    return max(until.values(), default=0.0)
-
-
-def show(batch: Batch) -> None:
-    """Prints the plan of a run: every stage to compute, sums by stage, and the whole."""
+def show(batch: Batch, every: bool = False) -> None:
+    """Prints the plan of a run: sums by experiment and by stage, and the whole. every: also each stage to compute."""
     graph, works = work(batch.experiments, batch.config["report"])
     forecasts = forecast(graph, batch.config)
     console = Console(highlight=False, soft_wrap=True)
-    for f in forecasts:
-        if not f.cached:
-            node = f.node
-            more = f" (+{len(node.cases) - 1} cases)" if len(node.cases) > 1 else ""
-            console.print(f"to compute  {node.stage:<10} {short(node.cases)}{more}  {_said(f.cost)}", markup=False)
-    console.print(_by_stage(forecasts))
+    if every:
+        for f in forecasts:
+            if not f.cached:
+                more = f" (+{len(f.node.cases) - 1} cases)" if len(f.node.cases) > 1 else ""
+                line = f"to compute  {f.node.title:<10} {short(f.node.cases)}{more}  {_said(f.cost)}"
+                console.print(line, markup=False)
+    console.print(_table("stage", _by_stage(forecasts)))
+    if len(works) > 1:
+        console.print(_table("experiment", _by_experiment(forecasts, works)))
     for experiment in batch.experiments:
         for what, why in experiment.not_run:
             console.print(f"{experiment.name}: not run: {what}, {why}", markup=False)
-    console.print(_whole(forecasts, batch.config, len(works)), markup=False)
+    console.print(_whole(graph, forecasts, batch.config, len(works)), markup=False)
+    if not every and not all(f.cached for f in forecasts):
+        console.print("every stage to compute: plan=stages")
 
 
 def _said(cost: Cost | None) -> str:
@@ -103,39 +82,51 @@ def _said(cost: Cost | None) -> str:
     return f"{cost.seconds:.1f} s {cost.peak_mb:.0f} MB, {cost.size / 1e6:.1f} MB on disk"
 
 
-def _by_stage(forecasts: list[Forecast]) -> Table:
+def _by_stage(forecasts: list[Forecast]) -> dict[str, list[Forecast]]:
+    """The dearest first."""
+    stages: dict[str, list[Forecast]] = {}
+    for f in forecasts:
+        stages.setdefault(f.node.stage, []).append(f)
+    return dict(sorted(stages.items(), key=lambda one: -sum(f.seconds for f in one[1])))
+
+
+def _by_experiment(forecasts: list[Forecast], works: list[Work]) -> dict[str, list[Forecast]]:
+    """The stages of each experiment that no earlier one has: what it adds to the run."""
+    left = {f.node.id: f for f in forecasts}
+    return {w.experiment.name: [left.pop(n) for n in w.graph.nodes if n in left] for w in works}
+
+
+def _table(first: str, groups: dict[str, list[Forecast]]) -> Table:
     table = Table()
-    table.add_column("stage")
-    for name in ("cached", "to compute", "seconds", "peak MB", "MB on disk"):
+    table.add_column(first, no_wrap=True)
+    for name in ("cached", "to do", "new", "seconds", "peak MB", "disk MB"):
         table.add_column(name, justify="right")
-    for stage in dict.fromkeys(f.node.stage for f in forecasts):
-        those = [f for f in forecasts if f.node.stage == stage]
-        costs = [f.cost for f in those if f.cost]
-        unknown = sum(not f.cached and f.cost is None for f in those)
-        mark = f" + {unknown} unknown" if unknown else ""
-        sums = (sum(c.seconds for c in costs), max((c.peak_mb for c in costs), default=0), sum(c.size for c in costs))
-        numbers = [f"{sums[0]:.1f}{mark}", f"{sums[1]:.0f}", f"{sums[2] / 1e6:.1f}"] if costs else [mark[3:], "", ""]
-        cached = sum(f.cached for f in those)
-        table.add_row(stage, str(cached or ""), str(len(those) - cached or ""), *numbers)
+    for name, those in groups.items():
+        todo = [f for f in those if not f.cached]
+        costs = [f.cost for f in todo if f.cost]
+        numbers = [len(those) - len(todo), len(todo), len(todo) - len(costs), sum(f.seconds for f in todo)]
+        numbers += [max((c.peak_mb for c in costs), default=0), sum(c.size for c in costs) / 1e6]
+        table.add_row(name, *(f"{n:.0f}" if n else "" for n in numbers))
     return table
 
 
-def _whole(forecasts: list[Forecast], config: dict, reports: int) -> str:
+def _whole(graph: Graph, forecasts: list[Forecast], config: dict, reports: int) -> str:
     todo = [f for f in forecasts if not f.cached]
     if not todo:
         return f"all {len(forecasts)} stages are cached; the {_count(reports, 'report')} would be written anew"
     costs = [f.cost for f in todo if f.cost]
-    seconds, size = sum(c.seconds for c in costs), sum(c.size for c in costs)
+    size = sum(c.size for c in costs)
     workers = config["runner"]["workers"]
-    least = max(seconds / workers, critical_path(forecasts))
     lines = [
         f"{_count(len(todo), 'stage')} to compute, {len(forecasts) - len(todo)} cached, {_count(reports, 'report')}",
-        f"{_time(seconds)} of work, at least {_time(least)} with {_count(workers, 'worker')}; "
+        f"{_time(sum(f.seconds for f in todo))} of work, about {_time(seconds_with(graph, forecasts, workers))} with "
+        f"{_count(workers, 'worker')} if nothing else runs; "
         f"up to {max((c.peak_mb for c in costs), default=0):.0f} MB in a process; {size / 1e6:.0f} MB on disk, "
         f"{_free(config['store']['path']) / 1e6:.0f} MB are free",
     ]
     if len(costs) < len(todo):
-        lines.append(f"not in these sums: {_count(len(todo) - len(costs), 'stage')} never computed before")
+        new = _count(len(todo) - len(costs), "stage")
+        lines.append(f"{new} never computed before: their seconds are a rough guess, memory and disk are not counted")
     if any(not f.keyed for f in todo):
         lines.append("what stands behind a stage to compute can turn out to be cached: these sums are upper bounds")
     return "\n".join(lines)

@@ -50,7 +50,7 @@ def main(arguments: list[str] | None = None) -> int:
         if run.config["plan"]:
             from flows.forecast import show
 
-            show(run)
+            show(run, every=run.config["plan"] == "stages")
             return 0
         from flows.sweep import run_batch
 

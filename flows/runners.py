@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import sys
 
 from tasks.errors import InputError
 
@@ -14,6 +15,12 @@ def task_runner(settings: dict):
     if workers < 1:
         raise InputError("runner.workers", expected="at least 1", found=str(workers))
     return {"threads": _threads, "processes": _processes, "dask": _dask, "ray": _ray}[settings["kind"]](settings)
+
+
+def in_flight(settings: dict) -> int:
+    """How many stages to hand to a runner at once: enough that no worker waits for the next, and no more, so that what
+    comes first can still be chosen. A cluster that runs already gets all: how many workers it has is its own matter."""
+    return sys.maxsize if settings.get("address") else 2 * settings["workers"]
 
 
 def _threads(settings: dict):

@@ -6,6 +6,7 @@ a type is written once, where it is used. What belongs to the run and not to a s
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import types
 import typing
@@ -118,6 +119,7 @@ DECIDING = {  # what the rest of the schema hangs on, beside the pipeline
     **dict.fromkeys(("dataset", "bones", "skeleton", "reconstruction", "runner"), "kind"),
     "animate": "function",
 }
+UNIONS = (types.UnionType, typing.Union)  # of A | B, and of one in which a Literal is
 RENAMED = {"lambda_": "lambda"}  # Python keywords that are the field's names in the config
 
 
@@ -159,7 +161,7 @@ def schema(config: dict, sweep: dict[str, object]) -> dict[str, object]:
     bones |= settings(BONES.get(config["bones"].get("kind"), SSDR))
     return {
         "seed": int,
-        "plan": bool,
+        "plan": bool | Literal["stages"],
         "method_seed": int | None,
         "confidence": settings(CONFIDENCE),
         "data_root": str,
@@ -300,11 +302,16 @@ def _typed(value: object, kind: object, path: str) -> object:
     if origin is Literal:
         if value in typing.get_args(kind) and not isinstance(value, bool):
             return value
-    elif isinstance(kind, types.UnionType):
+    elif origin in UNIONS:
         members = typing.get_args(kind)
         if value is None and type(None) in members:
             return None
-        return _typed(value, next(m for m in members if m is not type(None)), path)
+        *others, last = [m for m in members if m is not type(None)]
+        for member in others:
+            with contextlib.suppress(InputError):
+                return _typed(value, member, path)
+        with contextlib.suppress(InputError) if others else contextlib.nullcontext():
+            return _typed(value, last, path)
     elif origin is list:
         if isinstance(value, list):
             return [_typed(v, typing.get_args(kind)[0], f"{path}[{i}]") for i, v in enumerate(value)]
@@ -321,7 +328,7 @@ def describe(kind: object) -> str:
     """A type in words."""
     if typing.get_origin(kind) is Literal:
         return "one of " + ", ".join(str(a) for a in typing.get_args(kind))
-    if isinstance(kind, types.UnionType):
+    if typing.get_origin(kind) in UNIONS:
         return " or ".join("null" if m is type(None) else describe(m) for m in typing.get_args(kind))
     if typing.get_origin(kind) is list:
         return f"a list, each entry {describe(typing.get_args(kind)[0])}"

@@ -66,9 +66,14 @@ def key_of(job: Job) -> str:
         "settings": settings,
         "inputs": _digests(job.inputs),
         "files": job.files,
-        "versions": {name: version(name).split(".")[0] for name in ("numpy", "torch")},
+        "versions": _versions(),
     }
     return hashlib.sha256(canonical_json(content).encode()).hexdigest()[:32]
+
+
+@cache
+def _versions() -> dict[str, str]:
+    return {name: version(name).split(".")[0] for name in ("numpy", "torch")}
 
 
 def run(job: Job, say: Callable[[str, float], None] = _silent) -> Ref:

@@ -5,15 +5,17 @@ from __future__ import annotations
 import shlex
 import tempfile
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flows.artifacts import Board
 from flows.batch import Batch, Work, work
 from flows.config import Missing
+from flows.costs import Past, chains
 from flows.graph import Graph, Node, short
 from flows.progress import Progress
-from flows.runners import task_runner
+from flows.runners import in_flight, task_runner
 from flows.server import lost, server
 from flows.stage import Job, run
 from flows.store import CorruptArtefact, Ref, Store
@@ -174,18 +176,24 @@ def compute(graph: Graph, config: dict, progress: Progress) -> Outcome:
 
 
 def _pass(graph: Graph, config: dict, progress: Progress, outcome: Outcome) -> None:
-    """One walk over the graph: a node is submitted when its inputs are there, so no worker waits for another."""
+    """One walk over the graph: a node is submitted when its inputs are there, so no worker waits for another, and first
+    the one that begins the longest chain, so that no long stage is left to the end."""
     from prefect.futures import as_completed
 
     task = stage_task()
     waiting = [n for n in graph.nodes.values() if n.id not in outcome.refs and n.id not in outcome.errors]
+    past = Past(Store(config["store"]["path"]))
+    first = chains(graph, {n.id: past.seconds(n) for n in graph.nodes.values()})
+    waiting.sort(key=lambda n: -first[n.id])
+    most = in_flight(config["runner"])
     running: dict[object, Node] = {}
     futures: dict[str, object] = {}
     with tempfile.TemporaryDirectory(prefix="skelebones-") as folder:
         events = str(Path(folder) / "events.jsonl")
         progress.follow(events)
         while waiting or running:
-            for node in [n for n in waiting if all(u.id in outcome.refs for u in n.upstream())]:
+            ready = (n for n in waiting if all(u.id in outcome.refs for u in n.upstream()))
+            for node in list(islice(ready, max(most - len(running), 0))):
                 waiting.remove(node)
                 job = job_of(node, outcome.refs, config, events)
                 named = task.with_options(name=node.stage, task_run_name=f"{node.title}: {short(node.cases)}")

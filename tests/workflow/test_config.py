@@ -6,6 +6,8 @@ import subprocess
 import sys
 
 import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
 
 from flows import config, schema
 from flows.source import ROOT
@@ -210,3 +212,17 @@ def test_help_and_mistakes_import_neither_torch_nor_prefect(arguments):
     assert not imported & {"torch", "prefect", "numba", "pandas"}
     said = [line for line in done.stderr.splitlines() if not line.startswith("import time")]
     assert len(said) == (1 if done.returncode else 0)
+
+
+@pytest.mark.parametrize(
+    "chosen",
+    [
+        ("+experiment=table3_full", "dataset=quaternius", "method=mlp", "+ablation=[k_1,smooth]"),
+        ("+experiment=table4", "dataset=scene_dress", "method=bob", "+ablation=[clusters]"),
+        ("dataset=scene_figure", "reconstruction=cpu", "+ablation=[no_arap,frames_50]"),
+    ],
+)
+def test_configs_compose_as_hydra_composes_them(chosen):
+    with initialize_config_dir(str(config.CONF), version_base="1.3"):
+        plain = OmegaConf.to_container(compose("config", list(chosen)))
+    assert repr(OmegaConf.to_container(config._compose(chosen))) == repr(plain)

@@ -61,7 +61,7 @@ def main(arguments: list[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of our output, such as head, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except KeyboardInterrupt:
-        print("stopped; finished stages are kept and will not be computed again", file=sys.stderr)
+        print("stopped before anything was run", file=sys.stderr)
         return 130
     return 0
 

@@ -18,6 +18,7 @@ from flows.progress import Progress
 from flows.runners import in_flight, task_runner
 from flows.server import lost, server
 from flows.stage import Job, run
+from flows.stopping import stoppable
 from flows.store import CorruptArtefact, Ref, Store
 from tasks.errors import InputError
 
@@ -48,7 +49,7 @@ def run_batch(batch: Batch, show: bool = True) -> Path:
     """
     config = batch.config
     Store(config["store"]["path"])  # a store that cannot be used is said before anything starts
-    with server() as ready:
+    with stoppable(), server() as ready:
         graph, works = work(batch.experiments, config["report"])
         ready()
         cases = sum(len(experiment.cases) for experiment in batch.experiments)
@@ -78,7 +79,7 @@ def _flow(batch: Batch, graph: Graph, works: list[Work], show: bool):
         board = Board(experiment, graph, progress.note)
         progress.tell = board.update
         board.start()
-        with progress:
+        with progress, stoppable():
             for what, why in (pair for experiment in batch.experiments for pair in experiment.not_run):
                 progress.note(f"not run: {what}, {why}")
             outcome, reports = _computed_reports(batch, graph, works, progress, board)
@@ -188,7 +189,7 @@ def _pass(graph: Graph, config: dict, progress: Progress, outcome: Outcome) -> N
     most = in_flight(config["runner"])
     running: dict[object, Node] = {}
     futures: dict[str, object] = {}
-    with tempfile.TemporaryDirectory(prefix="skelebones-") as folder:
+    with tempfile.TemporaryDirectory(prefix="skelebones-") as folder, stoppable(folder):
         events = str(Path(folder) / "events.jsonl")
         progress.follow(events)
         while waiting or running:

@@ -26,10 +26,7 @@ from tasks.values import Canonical, Curve, Motion, Skeleton, Skinning, Surface
 _PULL = 0.001
 _FOCUS = 4.0  # power of w_a w_b: traces of both far away must not draw their joint from where they meet
 _SOFT = 0.03  # of the diagonal: a joint with this residual stays about where the curve puts it
-_HOLD = {
-    True: 0.003,
-    False: 0.03,
-}  # pull on joints in the refit where the tree is the curve's, and where it is the motion's
+_HOLD_CURVE, _HOLD_MOTION = 0.003, 0.03  # pull on joints in the refit, by whose tree it is
 _FRAMES, _POINTS = 100, 2500  # looked at while bones are pruned; the refit sees more
 _REFIT_FRAMES, _REFIT_POINTS = 300, 6000
 _INFLUENCES = 4  # bones a point follows while they are pruned: more let ghosts hide
@@ -74,6 +71,27 @@ class Articulation:
     areas: np.ndarray
 
 
+@dataclass(frozen=True)
+class Watched:
+    """What a tree is refitted to. chosen: (K,) numbers of points; more: (F,) numbers of frames; rest: (K, 3); paths:
+    (F, K, 3); few_paths: (f, K, 3), in the frames that the bones' transforms are of."""
+
+    chosen: np.ndarray
+    more: np.ndarray
+    rest: np.ndarray
+    paths: np.ndarray
+    few_paths: np.ndarray
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A refitted tree. parents: (J,); joints: (J, 3) float64; weights: (K, J) of the watched points."""
+
+    parents: np.ndarray
+    joints: np.ndarray
+    weights: np.ndarray
+
+
 def joints_by_motion(
     train: Motion,
     canonical: Canonical,
@@ -99,7 +117,8 @@ def joints_by_motion(
 
     max_joints: most joints; topology: ``motion`` takes the spanning tree of least joint gap, which is right for
     articulated bodies; ``curve`` keeps the curve's own tree, which does not tangle under cloth and soft tissue;
-    ``auto`` takes the first where its median gap is under ``rigid_residual``; knee: times the least error that fewer
+    ``auto`` takes the first where its median gap is under ``rigid_residual``, and else the second, unless the first
+    follows the motion clearly better; knee: times the least error that fewer
     bones may cost; missed: degrees by which a bone's points must miss without it to be safe; angle: degrees below
     which two bones that touch are one; shortest: run of curve below which a bone is dropped (curve topology); reach:
     how far a joint may lie from where its bones meet on the curve; rounds: rounds of SSDR once the bones are chosen;
@@ -113,25 +132,22 @@ def joints_by_motion(
     frames = _spread(train.frames, _FRAMES)
     bones = _bones(train, canonical, skinning, frames, chosen)
     bones = few_bones(bones, body, at_most=max_joints, knee=knee, missed=missed, angle=angle, rounds=rounds)
-    found = better_posed(by_motion(bones, body, reach), by_motion(bones, body, reach, relative=True), body)
-    soft = topology == "curve" or (topology == "auto" and np.median(_tree_residuals(found)) > rigid_residual)
-    if soft:
-        found = by_curve(bones, body, reach, shortest=shortest, angle=angle, at_most=max_joints)
-    order, parents, joints = _assemble(found, body)
-    joints, weights = _fit_skeleton(
-        train,
-        canonical,
-        body,
-        parents,
-        joints,
-        found.bones.transforms[:, order],
-        frames,
-        refits,
-        influences,
-        reach,
-        _HOLD[soft],
-    )
-    return Skeleton(joint_names(len(joints)), parents, joints.astype(np.float32), weights)
+    watched = _watch(train, canonical, body, frames)
+    refitting = {"rounds": refits, "influences": influences, "reach": reach * size}
+    fits = []
+    if topology != "curve":
+        tree = better_posed(by_motion(bones, body, reach), by_motion(bones, body, reach, relative=True), body)
+        fits.append(_fit_tree(tree, body, watched, hold=_HOLD_MOTION, **refitting))
+    if topology == "curve" or (topology == "auto" and np.median(_tree_residuals(tree)) > rigid_residual):
+        tree = by_curve(bones, body, reach, shortest=shortest, angle=angle, at_most=max_joints)
+        fits.append(_fit_tree(tree, body, watched, hold=_HOLD_CURVE, **refitting))
+    fit = fits[0] if len(fits) == 1 else _chosen(*fits, watched)
+    joints = keep_inside(fit.joints, surface, curve)
+    weights = fit.weights
+    if len(watched.chosen) < len(canonical.points):
+        seen = train.points[watched.more]
+        weights = spread_weights(seen, canonical.points, fit.parents, joints, watched.chosen, weights, influences)
+    return Skeleton(joint_names(len(joints)), fit.parents, joints.astype(np.float32), weights)
 
 
 def few_bones(
@@ -228,27 +244,35 @@ def keep_inside(joints: np.ndarray, surface: Surface, curve: Curve) -> np.ndarra
     return out
 
 
-def _fit_skeleton(train, canonical, body, parents, joints, transforms, frames, refits, influences, reach, hold):
-    """Joints and weights refitted on a part of points and frames, then all points' weights in one go."""
+def _watch(train: Motion, canonical: Canonical, body: Body, frames: np.ndarray) -> Watched:
     chosen = thin(canonical, body.surface, body.curve, _REFIT_POINTS)
-    rest = canonical.points[chosen].astype(np.float64)
-    start = Bones(rest, train.points[frames][:, chosen], np.zeros((len(rest), len(joints))), transforms, influences)
     more = _spread(train.frames, _REFIT_FRAMES)
-    joints, weights = refit(
-        train.points[more][:, chosen],
-        rest,
-        parents,
-        joints,
-        start.refit(transforms, start.weights).weights,
-        rounds=refits,
-        influences=influences,
-        reach=reach * body.size,
-        hold=hold,
-    )
-    joints = keep_inside(joints, body.surface, body.curve)
-    if len(chosen) < len(canonical.points):
-        weights = spread_weights(train.points[more], canonical.points, parents, joints, chosen, weights, influences)
-    return joints, weights
+    rest = canonical.points[chosen].astype(np.float64)
+    return Watched(chosen, more, rest, train.points[more][:, chosen], train.points[frames][:, chosen])
+
+
+def _fit_tree(
+    found: Articulation, body: Body, watched: Watched, *, rounds: int, influences: int, reach: float, hold: float
+) -> Fit:
+    """The tree over the bones, its joints and weights refitted to the motion of the watched points."""
+    order, parents, joints = _assemble(found, body)
+    transforms = found.bones.transforms[:, order]
+    nothing = np.zeros((len(watched.rest), len(joints)))
+    start = Bones(watched.rest, watched.few_paths, nothing, transforms, influences).refit(transforms, nothing)
+    how = {"rounds": rounds, "influences": influences, "reach": reach, "hold": hold}
+    return Fit(parents, *refit(watched.paths, watched.rest, parents, joints, start.weights, **how))
+
+
+def _chosen(by_motion: Fit, by_curve: Fit, watched: Watched) -> Fit:
+    """The curve's own tree, unless the motion's follows the points clearly better."""
+    return by_motion if _missed(by_motion, watched) < _CLEARLY * _missed(by_curve, watched) else by_curve
+
+
+def _missed(fit: Fit, watched: Watched) -> float:
+    """Mean of the summed squared distances of a frame."""
+    origin = watched.rest.mean(axis=0)
+    moments = skin_moments(watched.rest - origin, fit.weights, watched.paths - origin.astype(np.float32))
+    return float(skin_error(moments, posed(fit.parents, fit.joints - origin, moments)).mean())
 
 
 def _bones(train: Motion, canonical: Canonical, skinning: Skinning, frames, points) -> Bones:

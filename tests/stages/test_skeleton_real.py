@@ -128,12 +128,12 @@ def test_the_foxs_own_poses_come_back_from_its_points_alone(fox):
 
 
 @pytest.mark.slow
-def test_a_dancer_in_a_skirt_is_posed_and_keeps_the_curves_tree(shared_data):
+def test_a_dancer_in_a_skirt_is_posed_by_the_tree_that_follows_her(shared_data):
     path = shared_data / "mesh_sequences" / "human_samba.npz"
     motion = mesh_sequence.load(path=str(path), fps=24.0, faces=True, unit="unit")
     samba = prepare(thinned(motion), "first")
     skeleton = samba.joints(joints_by_motion, "motion")
     assert 12 <= len(skeleton.joints) <= 32
-    assert samba.lbs_percent(skeleton) < 0.6
+    assert samba.lbs_percent(skeleton) < 0.5
     above = np.linalg.norm(skeleton.joints[1:] - skeleton.joints[skeleton.parents[1:]], axis=1)
     assert above.max() < 0.35 * diagonal(samba.canonical.points)  # no link across the body

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -9,6 +10,8 @@ import numpy as np
 
 from tasks.errors import InputError
 from tasks.geometry.rotations import from_rotation_vector
+
+CHANNEL = re.compile("[XYZ](rotation|position)", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -35,7 +38,8 @@ class _Joint:
 def read_bvh(path: Path) -> Driver:
     """A .bvh file. Rotations are taken in the order of the channels; positions of joints but the root are left aside.
 
-    Raises InputError for what is no BVH, and for a motion of another size than the header says.
+    Raises InputError for what is no BVH, for a motion of another size than the header says and for numbers that are not
+    finite.
     """
     head, found, motion = path.read_text("utf-8", "replace").partition("MOTION")
     if not head.lstrip().startswith("HIERARCHY") or not found:
@@ -52,7 +56,12 @@ def read_bvh(path: Path) -> Driver:
     if count < 1 or columns < 1 or not seconds > 0 or len(numbers) != count * columns:
         expected = f"{count:.0f} frames of {columns} numbers, and a frame time"
         raise InputError(f"{path}: MOTION", expected=expected, found=f"{len(numbers)} numbers, {seconds:g} s")
-    return _driver(joints, numbers.reshape(int(count), columns), 1 / seconds)
+    rows = numbers.reshape(int(count), columns)
+    bad = np.flatnonzero(~np.isfinite(rows).all(1))
+    if len(bad):
+        found = f"others in frame {bad[0]} ({len(bad)} such frames)"
+        raise InputError(f"{path}: MOTION", expected="finite numbers", found=found, do="repair these frames")
+    return _driver(joints, rows, 1 / seconds)
 
 
 def _hierarchy(words: list[str]) -> list[_Joint]:
@@ -75,6 +84,9 @@ def _hierarchy(words: list[str]) -> list[_Joint]:
         elif word == "CHANNELS":
             count = int(words[at + 1])
             joints[stack[-1]].channels = words[at + 2 : at + 2 + count]
+            unknown = [c for c in joints[stack[-1]].channels if not CHANNEL.fullmatch(c)]
+            if unknown:
+                raise ValueError(f"unknown channel {unknown[0][:20]!r}")
             at += 2 + count
         elif word == "}":
             stack.pop()

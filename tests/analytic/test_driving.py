@@ -156,6 +156,8 @@ def test_bad_files_and_names(tmp_path):
         (good.replace("Frames: 40", "Frames: 41"), "41 frames of 21 numbers"),
         (good[:-30], "numbers"),
         (good.replace("CHANNELS 3", "CHANNELS x", 1), "damaged text"),
+        (good.replace("Zrotation", "Wrotation", 1), "unknown channel 'Wrotation'"),
+        (good.rpartition(" ")[0] + " nan\n", "others in frame 39"),
         (good.replace("OFFSET", "OFSET", 1), "damaged text"),
     ):
         path.write_text(text)

@@ -72,7 +72,7 @@ def batch(overrides: list[str], multirun: bool = False) -> Batch:
         report = cases[0].config["report"]
         alone = Experiment(report["name"], report["title"], (*flags, *overrides), cases, missing)
         return Batch(cases[0].config, [alone], False)
-    whole = schema.check(whole, schema.schema(whole, config.SWEEP))
+    whole = schema.check_run(schema.check(whole, schema.schema(whole, config.SWEEP)))
     kept = [text for text in overrides if config.parse(text).key_or_group not in (*OF_THE_WHOLE, "experiment")]
     used = set(overrides) - set(kept)
     experiments = []

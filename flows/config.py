@@ -167,7 +167,7 @@ def _sweep(
         variant = ",".join(filter(None, [ablation, label])) or NO_ABLATION
         name = chosen["dataset"] or config["dataset"].get("kind")
         try:
-            config = schema.check(config, schema.schema(config, SWEEP))
+            config = schema.check_run(schema.check(config, schema.schema(config, SWEEP)))
             nodes = _files(config["dataset"])
         except NotGiven as error:
             if missing is None:

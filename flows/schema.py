@@ -286,6 +286,20 @@ def check(config: dict, expected: dict[str, object], where: str = "") -> dict:
     return out
 
 
+def check_run(config: dict) -> dict:
+    """The config again. Raises InputError for values of the run itself that no stage checks."""
+    name, cap = config["report"]["name"], config["memory"]["max_gb"]
+    if name in ("", ".", "..") or set(name) & set("/\\%&<>"):
+        raise InputError("report.name", expected="the name of a folder", found=repr(name), do="set report.path instead")
+    if cap is not None and not cap > 0:
+        raise InputError("memory.max_gb", expected="a number above zero, or null", found=str(cap))
+    seeds = {"seed": [config["seed"]], "method_seed": [config["method_seed"]], "sweep.seeds": config["sweep"]["seeds"]}
+    for where, given in seeds.items():
+        if any(seed is not None and seed < 0 for seed in given or []):
+            raise InputError(where, expected="0 or more", found=str(min(s for s in given if s is not None)))
+    return config
+
+
 def unknown_key(path: str, valid: list[str]) -> InputError:
     """The error for a key that does not exist, with the nearest one that does."""
     name = path.rpartition(".")[2]

@@ -56,14 +56,20 @@ def scene(config: dict, add, name: str) -> tuple[Nodes, list[Node]]:
     return nodes, [add("evaluate", schema.EVALUATE_SCENE, {}, "metrics", **images, motion=truth)]
 
 
+def posed(config: dict, add, nodes: Nodes) -> Nodes:
+    """The Gaussians in the unseen poses, where something is made of them: views or files."""
+    wanted = "unseen_views" in nodes or {"ply", "splat", "rigged_ply"} & set(config["export"]["formats"])
+    if not wanted or "reconstruction" not in nodes:
+        return {}
+    inputs = {n: nodes[n] for n in ("reconstruction", "animation")}
+    return {"posed": add("pose", schema.POSE_GAUSSIANS, {}, "reconstruction", **inputs)["reconstruction"]}
+
+
 def unseen_views(config: dict, add, nodes: Nodes) -> list[Node]:
     """The metrics of the posed Gaussians, rendered where cameras see the unseen frames; none without such cameras."""
     if "unseen_views" not in nodes:
         return []
-    inputs = {n: nodes[n] for n in ("reconstruction", "animation")}
-    posed = add("pose", schema.POSE_GAUSSIANS, {}, "reconstruction", **inputs)["reconstruction"]
-    nodes["posed"] = posed
-    return [_compare(config, add, nodes, posed, nodes["unseen_views"])]
+    return [_compare(config, add, nodes, nodes["posed"], nodes["unseen_views"])]
 
 
 def _meshes(config: dict, add) -> Nodes:

@@ -62,6 +62,7 @@ def plan(case: Case, graph: Graph) -> Planned:
     metrics = [add("evaluate", schema.EVALUATE_RIG, config["evaluate"], "metrics", "evaluate rig", **shared)]
     if config["pipeline"] == "animate":
         nodes |= _animation(config, add, nodes)
+        nodes |= intake.posed(config, add, nodes)
         unseen = {n: nodes[n] for n in ("animation", "test", "canonical")}
         metrics.append(add("evaluate", schema.EVALUATE, config["evaluate"], "metrics", **unseen))
         metrics += intake.unseen_views(config, add, nodes)

@@ -84,6 +84,9 @@ def exported(overrides: list[str]) -> list[Node]:
 def test_gaussians_are_exported_as_they_are_posed_and_only_where_there_are_some():
     (node,) = exported([*TABLE4, "sweep.methods=[partmm]", "export.formats=[ply]"])
     assert node.inputs["reconstruction"][0].stage == "pose"
+    captured = ["dataset=dnerf", "dataset.path=nowhere", "reconstruction=cpu", "sweep.datasets=null"]
+    (node,) = exported([*captured, "sweep.methods=[lbs]", "export.formats=[rigged_ply]"])
+    assert node.inputs["reconstruction"][0].stage == "pose"
     (node,) = exported(["+experiment=table2", "sweep.datasets=[scene_animal]", "export.formats=[splat]"])
     assert node.inputs["reconstruction"][0].stage == "gaussians"
     with pytest.raises(InputError, match=r"export.formats.*ply: no reconstruction.*reconstruction=cpu"):

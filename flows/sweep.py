@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 import tempfile
 from dataclasses import dataclass, field, replace
@@ -48,7 +49,8 @@ def run_batch(batch: Batch, show: bool = True) -> Path:
     finished stays in the store. Where there is an index, an experiment whose data is bad is left out and says why.
     """
     config = batch.config
-    Store(config["store"]["path"])  # a store that cannot be used is said before anything starts
+    Store(config["store"]["path"])  # a store or a place for reports that cannot be used is said before anything starts
+    check_place(Path(config["report"]["path"]).expanduser())
     with stoppable(), server() as ready:
         graph, works = work(batch.experiments, config["report"])
         ready()
@@ -60,6 +62,14 @@ def run_batch(batch: Batch, show: bool = True) -> Path:
             if not (written and lost.is_set()):  # else only the end of the run could not be told to the server
                 raise
         return written[0]
+
+
+def check_place(folder: Path) -> None:
+    """Raises InputError where no report can be written; makes nothing, for a run that fails is to leave no trace."""
+    there = next(p for p in (folder.absolute(), *folder.absolute().parents) if p.exists())
+    if not (there.is_dir() and os.access(there, os.W_OK | os.X_OK)):
+        found = "no permission to write" if there.is_dir() else "a file"
+        raise InputError("report.path", expected="a folder that can be written", found=f"{found}: {there}")
 
 
 def _flow(batch: Batch, graph: Graph, works: list[Work], show: bool):

@@ -13,7 +13,7 @@ from flows.progress import Progress
 from flows.runners import task_runner
 from flows.stage import Job, key_of, run
 from flows.store import CorruptArtefact, Store
-from flows.sweep import StageFailed, compute, raise_first
+from flows.sweep import StageFailed, check_place, compute, raise_first
 from tasks.errors import InputError
 from tasks.workspace import Workspace
 
@@ -243,6 +243,14 @@ def test_memory_cap_is_one_clear_line(tmp_path):
     with pytest.raises(InputError, match=r"memory.max_gb.*at most 0.001 GB"):
         Workspace(tmp_path, max_gb=0.001).say("anything", 0.0)
     Workspace(tmp_path).say("anything", 0.0)
+
+
+def test_a_place_where_no_report_can_lie_is_said_before_anything_runs(tmp_path):
+    check_place(tmp_path / "new" / "reports")
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match=r"report.path.*a file"):
+        check_place(tmp_path / "file" / "reports")
 
 
 def test_short_names():

@@ -11,6 +11,7 @@ from flows.provenance import command
 from flows.reporting import Report, paper_numbers, places, tables_of
 from tasks.errors import InputError
 
+PLACES = ("data_root", "store.path", "report.path", "runner", "runner.workers", "runner.address")  # change no number
 COLLECTION = "paper"  # the experiment whose order and title the page of a folder of reports has
 
 
@@ -61,14 +62,26 @@ def index_batch(batch: Batch, reports: list[Report]) -> Path:
 
 
 def index_folder(folder: Path) -> Path:
-    """Writes the page of all reports that lie in a folder, whichever runs they are from. Returns its path."""
+    """Writes the page of all reports that lie in a folder, whichever runs they are from, and names the collection's
+    experiments that have none there. Returns its path."""
     collection = config.whole([f"+experiment={COLLECTION}"])
     order = collection["sweep"]["experiments"]
     found = [read(file.parent) for file in sorted(folder.glob("*/provenance.json"))]
     if not found:
         raise InputError(str(folder), expected="a folder of reports", found="none in it")
+    there = {r.experiment.name for r in found}
+    found += [_absent(name, folder) for name in order if name not in there]
     found.sort(key=lambda r: order.index(r.experiment.name) if r.experiment.name in order else len(order))
     return _write_index(folder, collection["report"]["title"], found)
+
+
+def _absent(name: str, folder: Path) -> Report:
+    """An experiment that has no report in a folder."""
+    arguments = (f"+experiment={name}",)
+    title = config.whole(list(arguments))["report"]["title"]
+    return Report(
+        Experiment(name, title, arguments, [], [Missing("the experiment", f"no report in {folder.name}/{name}")])
+    )
 
 
 def _write_index(folder: Path, title: str, reports: list[Report]) -> Path:
@@ -81,6 +94,7 @@ def _write_index(folder: Path, title: str, reports: list[Report]) -> Path:
         if r.cases[0].config["report"]["paper_table"]
     ]
     absent = {m.stands_for: m.why for r in reports for m in r.experiment.missing if m.stands_for}
+    origin = made[0].provenance if made else {}
     sections = [
         index.Section(
             name=r.experiment.name,
@@ -89,10 +103,28 @@ def _write_index(folder: Path, title: str, reports: list[Report]) -> Path:
             tables=r.tables,
             figures=[picture for _, picture in r.figures],
             missing=r.experiment.not_run,
+            paper_table=r.cases[0].config["report"]["paper_table"] if r.folder else None,
+            remarks=_remarks(r, origin),
         )
         for r in reports
     ]
-    origin = made[0].provenance if made else {}
-    page = index.html(title, sections, coverage.cover(paper_numbers(), measured, absent), origin)
+    covered = coverage.cover(paper_numbers(), measured, absent)
+    page = index.html(title, sections, covered, origin, coverage.claims(paper_numbers(), covered))
     report.write_page(folder / "index.html", page)
     return folder / "index.html"
+
+
+def _remarks(report: Report, first: dict) -> list[str]:
+    """What sets a report apart from the first one on the page, and from its experiment as it stands in conf/."""
+    if not report.folder:
+        return []
+    said = []
+    git, other = report.provenance.get("git", {}), first.get("git", {})
+    if git.get("commit") != other.get("commit"):
+        said.append(f"Made at another commit than the reports above: {git.get('commit', 'unknown')[:12]}.")
+    if report.provenance.get("machine") != first.get("machine"):
+        said.append("Made on another machine than the reports above.")
+    own = [a for a in report.experiment.arguments[1:] if a.partition("=")[0] not in PLACES]
+    if own:
+        said.append(f"Not the whole experiment, or another one: it was run with {' '.join(own)}.")
+    return said

@@ -15,7 +15,7 @@ from jinja2 import Environment
 from markupsafe import Markup
 
 from tasks.evaluation import page, typeset
-from tasks.evaluation.coverage import Covered
+from tasks.evaluation.coverage import Claim, Covered
 from tasks.evaluation.metrics import metric_of
 from tasks.evaluation.tables import Table, digits_for, printed_digits
 from tasks.values import Picture
@@ -39,6 +39,11 @@ pre { background: var(--card); border-radius: 8px; padding: .55rem .8rem; margin
 .coverage tr.group th { text-align: left; padding-top: .8rem; font-weight: 600; position: static; box-shadow: none;
   white-space: normal }
 .coverage tr.group small { display: block; color: var(--soft); font-weight: 400 }
+.claims { list-style: none; margin: .3rem 0 .9rem; padding: 0; color: var(--ink) }
+.claims li { padding: .12rem 0 }
+.claims b { font-weight: 600; display: inline-block; min-width: 3.6rem }
+.claims .holds b { color: var(--real) }
+.claims .fails b { color: var(--subst) }
 .badge.reproduced { color: var(--real) }
 .badge.not { color: var(--soft) }
 .gallery { display: grid; gap: 1rem; align-items: start;
@@ -50,7 +55,7 @@ pre { background: var(--card); border-radius: 8px; padding: .55rem .8rem; margin
 .picture svg { max-width: 100%; height: auto }
 .wide { grid-column: 1 / -1 }
 @media (max-width: 40rem) { .broad .pan img { width: 36rem } .coverage { font-size: .84rem }
-  .coverage td, .coverage th { padding: .3rem .35rem } }
+  .coverage td, .coverage th { padding: .3rem .3rem } .coverage .badge { font-size: .64rem; padding: .02rem .35rem } }
 """
 
 _PAGE = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(
@@ -70,9 +75,19 @@ _PAGE = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_
 <h2>The paper's tables, cell by cell</h2>
 <p class="lead">{{ counts }}. Differences are ours − the paper's; on substitute data the rows compare, the numbers do \
 not.</p>
-{% for number, groups, open, said in coverage %}
+{% for number, groups, open, said, claims, commands in coverage %}
 <details{% if open %} open{% endif %}>
 <summary>Table {{ number }}: {{ said }}</summary>
+{% for command in commands %}
+<pre>{{ command }}</pre>
+{% endfor %}
+{% if claims %}
+<ul class="claims">
+{% for c in claims %}
+<li class="{{ c.verdict }}"><b>{{ c.verdict }}</b> {{ c.said }}</li>
+{% endfor %}
+</ul>
+{% endif %}
 <div class="scroll">
 <table class="coverage">
 <thead><tr><th>method</th><th>paper</th><th>ours</th><th>diff.</th><th>status</th></tr></thead>
@@ -94,6 +109,9 @@ not.</p>
 <section id="{{ s.name }}">
 <h2>{{ s.title }}</h2>
 <pre>{{ s.command }}</pre>
+{% for remark in s.remarks %}
+<p class="missing">{{ remark }}</p>
+{% endfor %}
 {% for what, why in s.missing %}
 <p class="missing"><b>{{ what }}</b> not run: {{ why }}</p>
 {% endfor %}
@@ -130,7 +148,7 @@ not.</p>
 @dataclass(frozen=True)
 class Section:
     """An experiment on the page. name: its folder beside the page; command: that makes its numbers; missing: (what was
-    not run, why)."""
+    not run, why); paper_table: the paper's table that it stands beside; remarks: what else to know of its run."""
 
     name: str
     title: str
@@ -138,6 +156,8 @@ class Section:
     tables: Sequence[Table]
     figures: Sequence[Picture]
     missing: Sequence[tuple[str, str]]
+    paper_table: int | None = None
+    remarks: Sequence[str] = ()
 
 
 def html(
@@ -145,17 +165,25 @@ def html(
     sections: Sequence[Section],
     coverage: Mapping[int, Sequence[Covered]],
     provenance: Mapping[str, Any],
+    claims: Mapping[int, Sequence[Claim]] | None = None,
 ) -> str:
     """The page. coverage: every printed cell by the paper's table; provenance: of one of the reports, for what they
-    share: commit, machine, versions."""
+    share: commit, machine, versions; claims: what each table claims, and whether it holds here."""
     seen: set[bytes] = set()
     cells = [cell for table in coverage.values() for cell in table]
     facts = page.facts_of({n: provenance[n] for n in ("git", "machine", "versions") if n in provenance})
+    commands: dict[int, list[str]] = {}
+    for section in sections:
+        if section.paper_table and section.tables:
+            commands.setdefault(section.paper_table, []).append(section.command)
     return _PAGE.render(
         title=title,
         style=Markup(page.STYLE + _STYLE),
         sections=[_section(section, seen) for section in sections],
-        coverage=[_table(number, table) for number, table in coverage.items()],
+        coverage=[
+            (*_table(number, table), [_claim(c) for c in (claims or {}).get(number, ())], commands.get(number, ()))
+            for number, table in coverage.items()
+        ],
         counts=_counts(cells),
         facts=facts,
     )
@@ -172,6 +200,7 @@ def _section(section: Section, seen: set[bytes]) -> dict[str, Any]:
         "title": section.title,
         "command": section.command,
         "missing": section.missing,
+        "remarks": section.remarks,
         "tables": [Markup(typeset.html(table)) for table in section.tables],
         "figures": [(picture.caption, *_shown(picture)) for picture in fresh],
         "shown_before": [picture.caption for picture in before],
@@ -210,12 +239,24 @@ def _table(number: int, cells: Sequence[Covered]) -> tuple[int, list, bool, str]
 
 
 def _reasons(cells: Sequence[Covered]) -> list[str]:
-    """Why cells of a column were not run, a line for every reason."""
+    """What ours is the mean of, and why cells of a column were not run, a line for every reason."""
     whys: dict[str, list[str]] = {}
     for cell in cells:
         if cell.why:
             whys.setdefault(cell.why, []).append(cell.method)
-    return [f"{', '.join(names) if len(names) < len(cells) else 'not run'}: {why}" for why, names in whys.items()]
+    said = [f"{', '.join(names) if len(names) < len(cells) else 'not run'}: {why}" for why, names in whys.items()]
+    means = dict.fromkeys(c.of for c in cells if c.of)
+    remarks = dict.fromkeys(c.remark for c in cells if c.remark)
+    return [f"ours: mean over {', '.join(of)}" for of in means] + list(remarks) + said
+
+
+def _claim(claim: Claim) -> dict[str, str]:
+    """A claim as a line: the paper's change, and ours."""
+    metric = metric_of(claim.metric)
+    change = f"{typeset.number(claim.printed, 1, signed=True)} % in the paper, "
+    change += f"{typeset.number(claim.ours, 1, signed=True)} % here"
+    said = f"{claim.lead} against {claim.other}, {claim.column}, {metric.label}: {change}"
+    return {"verdict": "holds" if claim.holds else "fails", "said": said}
 
 
 def _cell(cell: Covered, digits: int, printed: int) -> dict[str, str]:

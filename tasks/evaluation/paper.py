@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 from tasks.errors import InputError
 from tasks.evaluation.metrics import METRICS
+
+_MORE = ("ours", "means", "leads", "remarks")
 
 
 @dataclass(frozen=True)
@@ -29,14 +31,19 @@ class PaperCell:
 
 @dataclass(frozen=True)
 class Paper:
-    """A paper's printed cells. methods, columns: labels by method and by "dataset/subject"; absent: why "methods" or
-    "columns" are not run here."""
+    """A paper's printed cells. methods, columns: labels by method and by "dataset/subject"; absent: why "methods",
+    "columns" or "metrics" are not run here; ours: our name of a row, where it differs; means: datasets whose mean
+    stands beside a column; leads: by a table's number the row that it is about; remarks: by column."""
 
     source: str
     methods: Mapping[str, str]
     columns: Mapping[str, str]
     absent: Mapping[str, Mapping[str, str]]
     cells: tuple[PaperCell, ...]
+    ours: Mapping[str, str] = field(default_factory=dict)
+    means: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    leads: Mapping[int, str] = field(default_factory=dict)
+    remarks: Mapping[str, str] = field(default_factory=dict)
 
     def table(self, number: int) -> tuple[PaperCell, ...]:
         """The cells of one table of the paper, in its order."""
@@ -44,7 +51,8 @@ class Paper:
 
 
 def paper_of(config: Mapping[str, Any]) -> Paper:
-    """The paper from the content of its yaml file (keys source, methods, columns, absent, cells).
+    """The paper from the content of its yaml file (keys source, methods, columns, absent, cells, and
+    where there is something to say ours, means, leads, remarks).
 
     Raises InputError, naming the cell, for an unknown key or metric, or two values for one cell.
     """
@@ -55,7 +63,8 @@ def paper_of(config: Mapping[str, Any]) -> Paper:
         if key in seen:
             raise InputError(f"paper.cells[{i}]", expected="one value a cell", found=f"a second one for {key}")
         seen.add(key)
-    return Paper(config["source"], dict(config["methods"]), dict(config["columns"]), dict(config["absent"]), cells)
+    labels = (dict(config[name]) for name in ("methods", "columns", "absent"))
+    return Paper(config["source"], *labels, cells, *(dict(config.get(name, {})) for name in _MORE))
 
 
 def _cell(index: int, entry: Mapping[str, Any]) -> PaperCell:

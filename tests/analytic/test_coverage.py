@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 
 from tasks.evaluation import index, video
-from tasks.evaluation.coverage import Measured, cover
+from tasks.evaluation.coverage import Measured, claims, cover
 from tasks.evaluation.page import size_of
 from tasks.evaluation.paper import paper_of
 from tasks.evaluation.rows import join
@@ -56,6 +57,44 @@ def test_the_papers_own_data_wins_and_a_run_knows_best_what_is_absent():
     found = statuses(cover(paper(), both, {"d4d/animals": "its file is absent"})[3])
     assert found["lbs", "VTO dress"] == (52.0, "reproduced", "")
     assert found["lbs", "d4d/animals"][2] == "its file is absent"
+
+
+def test_a_mean_over_several_datasets_stands_beside_a_printed_mean():
+    known = paper()
+    known = replace(
+        known, means={"d4d/animals": ["fox", "horse"]}, ours={"gru": "net"}, remarks={"d4d/animals": "units"}
+    )
+    values = {"fox": (10.0, 12.0), "horse": (20.0,), "cat": (500.0,)}
+    rows = join([row("lbs", v, dataset=d, subject=d, seed=s) for d, each in values.items() for s, v in enumerate(each)])
+    rows = join([rows, row("net", 30.0, dataset="cloth", subject="cloth")])
+    found = cover(known, [Measured(3, rows, {}, {"cloth/cloth": "vto/dress"})], {"d4d/animals": "absent"})[3]
+    assert statuses(found)["lbs", "d4d/animals"] == (15.5, "substitute data", "")  # a subject's seeds count as one
+    assert statuses(found)["gru", "VTO dress"] == (30.0, "substitute data", "")
+    (animals,) = [c for c in found if c.column == "d4d/animals"]
+    assert animals.of == ("fox", "horse")
+    assert animals.remark == "units"
+
+
+def test_claims_say_whether_the_order_of_two_rows_is_the_papers():
+    known = replace(paper(), leads={3: "gru"})
+    for value, holds in ((40.0, True), (70.0, False)):
+        rows = join([row(m, v, dataset="s", subject="c") for m, v in (("lbs", 50.0), ("gru", value), ("mlp", 1.0))])
+        (claim,) = claims(known, cover(known, [Measured(3, rows, {}, {"s/c": "vto/dress"})], {}))[3]
+        assert (claim.lead, claim.other, claim.column) == ("gru", "lbs", "VTO dress")
+        assert claim.printed == pytest.approx(100 * (37.5 / 52.2 - 1))
+        assert claim.ours == pytest.approx(100 * (value / 50.0 - 1))
+        assert claim.holds == holds
+
+
+def test_what_stands_beside_the_paper_exists():
+    from flows.config import groups
+    from flows.reporting import paper_numbers
+
+    known = paper_numbers()
+    assert {d for several in known.means.values() for d in several} <= set(groups()["dataset"])
+    assert set(known.ours.values()) <= set(groups()["method"])
+    assert set(known.ours) | set(known.leads.values()) <= set(known.methods)
+    assert set(known.means) | set(known.remarks) <= set(known.columns)
 
 
 def test_the_page_holds_all_and_loads_nothing():

@@ -108,6 +108,8 @@ def _benchmark(case: Case, name: str, add) -> Planned:
         own = {"tracing": schema.arguments(schema.CURVE, config["skeleton"]["curve"], config["seed"])}
         surface = config["skeleton"]["surface"]
         inputs["surface"] = add("surface", schema.SURFACE, surface, "surface", canonical=nodes["canonical"])["surface"]
+    elif config["pipeline"] == "benchmark_stages":
+        own = _all_stages(config)
     elif "clustering" in signature(function)[1]:
         stages = {"clustering": schema.CLUSTER, "decomposition": schema.SSDR}
         own = {n: schema.arguments(f, config["bones"], config["seed"]) for n, f in stages.items()}
@@ -115,6 +117,22 @@ def _benchmark(case: Case, name: str, add) -> Planned:
     measured = add("benchmark", function, config["benchmark"] | own, outputs, **inputs)
     drawn = {"picture": measured["picture"]} if "picture" in measured.outputs else {}
     return Planned(case, name, (measured,), nodes | drawn)
+
+
+def _all_stages(config: dict) -> dict[str, dict]:
+    """The settings of every stage without training, by the names that a benchmark has for them."""
+    skeleton = config["skeleton"]
+    stages = {
+        "clustering": (schema.CLUSTER, config["bones"]),
+        "decomposition": (schema.SSDR, config["bones"]),
+        "closing": (schema.SURFACE, skeleton["surface"]),
+        "tracing": (schema.CURVE, skeleton["curve"]),
+        "jointing": (schema.JOINTS["motion"], skeleton["motion"]),
+        "posing": (schema.POSES, skeleton["poses"]),
+        "parting": (schema.PARTS, config["parts"]),
+        "matching": (schema.MATCHING, config["animate"]),
+    }
+    return {name: schema.arguments(function, node, config["seed"]) for name, (function, node) in stages.items()}
 
 
 def _rig(config: dict, add) -> dict[str, Output]:

@@ -47,6 +47,10 @@ BENCHMARKS = {
         ("fps", "p99_ms", "clip_fps", "query_ms", "recall_at_7", "build_seconds", "memory"),
         {},
     ),
+    "benchmark_stages": (
+        ("points_count", "frames_count", "bones_count", "seconds", "cpu_seconds", "memory"),
+        {"Stage by stage": ("seconds", "cpu_seconds", "memory")},
+    ),
     "benchmark_rasterizer": (
         ("time_ratio", "forward_ratio"),
         {
@@ -66,6 +70,7 @@ BENCHMARKS = {
         },
     ),
 }
+BY_CASE = ("benchmark_rasterizer", "benchmark_stages")  # their rows are cases; the first table is about all of them
 SCENES = ("images_count", "views_count", "frames_count", "fill_pct", "on_subject_pct")
 CLOTH = ("deep_pct", "depth_995", "strain_p99_pct", "speed_max", "frames_count")
 OTHER_WAYS = tuple(f"by {way}" for way in JOINTS)  # ends of the rows' names that show the other way to joints
@@ -286,12 +291,13 @@ def _benchmark_tables(cases: list[Case], rows, settings: dict, common: dict) -> 
     first, others = BENCHMARKS[config["pipeline"]]
     repeats = config["benchmark"]["repeats"]
     runs = f"{repeats} runs of ours and {config['benchmark'].get('peer_repeats', repeats)} of the peer"
+    peer = any(name.startswith("peer_") for metrics in others.values() for name in metrics)
     notes = [
-        f"Medians of {runs if others else f'{repeats} runs'}, timed when the stage was computed: a run that takes it "
+        f"Medians of {runs if peer else f'{repeats} runs'}, timed when the stage was computed: a run that takes it "
         "from the store shows the same times.",
         *([settings["note"]] if settings["note"] else []),
     ]
-    if others:
+    if peer:
         notes.insert(0, "Ratios are ours / the peer's, timed in turn in one process; below 1 is better.")
     several = rows["dataset"].nunique() > 1
     subject = rows["dataset"] + " " + rows["subject"] if several else rows["subject"]
@@ -302,7 +308,7 @@ def _benchmark_tables(cases: list[Case], rows, settings: dict, common: dict) -> 
         return unranked(build(turned, title=title, metrics=metrics, notes=notes, **common))
 
     tables = [table(settings["title"], first, notes)]
-    if config["pipeline"] == "benchmark_rasterizer":  # its rows are cases, and the first table shows the worst of them
+    if config["pipeline"] in BY_CASE:
         turned = _by_case(rows)
     return [*tables, *(table(t, metrics, []) for t, metrics in others.items())]
 

@@ -63,6 +63,7 @@ BENCHMARKS = {
     "benchmark_skeleton": "tasks.benchmarks.skeleton:benchmark_skeleton",
     "scale_bones": "tasks.benchmarks.scale:scale_bones",
     "benchmark_matching": "tasks.benchmarks.matching:benchmark_matching",
+    "benchmark_stages": "tasks.benchmarks.stages:benchmark_stages",
 }
 GARMENTS = {
     "body": "tasks.garments.body:anny_body",
@@ -110,9 +111,7 @@ RUNNER = {"kind": Literal["threads", "processes", "dask", "ray"], "workers": int
 CLUSTERS = ("dask", "ray")  # runners that may use workers which run already
 FROM_RUN = {"seed"}  # arguments that come from the top of the config
 OF_STAGES = {
-    "clustering",
-    "decomposition",
-    "tracing",
+    *("clustering", "decomposition", "closing", "tracing", "jointing", "posing", "parting"),
     "matching",
 }  # a benchmark's arguments that are whole stages' settings
 DECIDING = {  # what the rest of the schema hangs on, beside the pipeline
@@ -145,7 +144,7 @@ def schema(config: dict, sweep: dict[str, object]) -> dict[str, object]:
     dataset = config["dataset"]
     pipeline = config["pipeline"]
     skeleton: dict[str, object] = {"kind": Literal["curve", "given"]}
-    if pipeline == "benchmark_skeleton":
+    if pipeline in ("benchmark_skeleton", "benchmark_stages"):
         skeleton["kind"] = Literal["curve"]
     if config["skeleton"].get("kind") != "given":
         skeleton |= {
@@ -156,7 +155,7 @@ def schema(config: dict, sweep: dict[str, object]) -> dict[str, object]:
             **{name: settings(function) for name, function in JOINTS.items()},
         }
     bones = {"kind": Literal["ssdr", "clusters", "gaussian"], **settings(CLUSTER)}
-    if pipeline in ("benchmark_bones", "scale_bones"):
+    if pipeline in ("benchmark_bones", "scale_bones", "benchmark_stages"):
         bones["kind"] = Literal["ssdr"]
     bones |= settings(BONES.get(config["bones"].get("kind"), SSDR))
     return {
@@ -227,7 +226,7 @@ def _method(config: dict) -> dict[str, object]:
     benchmark, own = BENCHMARKS.get(str(config["pipeline"])), {}
     if benchmark:
         own = {"benchmark": {n: t for n, t in settings(benchmark).items() if n not in OF_STAGES}}
-        if config["pipeline"] != "benchmark_matching":
+        if config["pipeline"] not in ("benchmark_matching", "benchmark_stages"):
             return {"animate": labels} | own
     if config["pipeline"] in ("reconstruct", "make_scenes"):
         return {"animate": labels}

@@ -100,6 +100,11 @@ def _reset_peak() -> float | None:
     return _status("VmRSS")
 
 
+def in_use() -> float | None:
+    """MB that the process uses now, or None where the system does not say."""
+    return _status("VmRSS")
+
+
 def _status(key: str) -> float | None:
     try:
         with open("/proc/self/status", encoding="ascii") as file:

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tasks.benchmarks import cgal, cost, dem_bones, rasterizer
+from tasks.benchmarks import cgal, cost, dem_bones, rasterizer, stages
 from tasks.benchmarks.bones import benchmark_bones
 from tasks.benchmarks.scale import scale_bones, subdivided
 from tasks.benchmarks.skeleton import benchmark_skeleton, counts, limbs
@@ -279,3 +279,28 @@ def test_the_peer_in_warp_draws_what_ours_draws():
     ours = [*images, *torch.autograd.grad(images[:2], leaves, of_images)]
     for a, b in zip(theirs, (t.detach().numpy() for t in ours), strict=True):
         assert np.abs(a.reshape(b.shape) - b).max() < 2e-5 * np.abs(b).max()
+
+
+def test_all_stages_are_timed_and_add_up(monkeypatch):
+    """What the stages do is tested elsewhere: here they hand on names, to see that each is timed with its settings."""
+    names = ("cluster", "ssdr", "closed_surface", "curve_skeleton", "joints_by_motion", "find_parts", "build_database")
+    seen = []
+
+    def stage(name):
+        return lambda *_, **settings: seen.append((name, settings)) or name
+
+    for name in (*names, "fit_poses"):
+        monkeypatch.setattr(stages, name, stage(name))
+    monkeypatch.setattr(stages.partmm, "animate", stage("animate"))
+    motion, canonical = bending_rod(frames=3)
+    own = {"decomposition": {}, "closing": {}, "tracing": {"speed": 1}, "jointing": {}, "posing": {}, "parting": {}}
+    settings = {"clustering": {"max_bones": 4}, **own, "matching": {"k": 7}}
+    size = {"subdivisions": 1, "repeats": 2, "threads": 1}
+    found = named(stages.benchmark_stages(motion, motion, canonical, **settings, **size))
+    each = [found[f"seconds@{n}"] for n in ("clusters", "bones", "surface", "curve", "skeleton", "poses", "PartMM")]
+    assert 0 < sum(each) < found["seconds"]
+    assert found["points_count"] == subdivided(motion, canonical)[0].points.shape[1]
+    assert (found["frames_count"], found["bones_count"]) == (3, 4)
+    assert [s for n, s in seen if n == "curve_skeleton"] == [{"speed": 1}] * 3  # once to compile, twice timed
+    with pytest.raises(InputError, match="subdivisions"):
+        stages.benchmark_stages(motion, motion, canonical, **settings, **size | {"subdivisions": 9})

@@ -9,7 +9,7 @@ from tasks.geometry.skinning import skin
 from tasks.motion import kernel, response
 from tasks.motion.posed import Posed
 from tasks.motion.query import check_poses
-from tasks.motion.regression import features, from_numbers, shape_units, to_numbers
+from tasks.motion.regression import features, from_numbers, joint_weights, shape_units, to_numbers
 from tasks.values import Animation, Poses, Training
 
 
@@ -51,11 +51,13 @@ def animate(
         filters, unseen = response.fit(x, left[:, bone], known.poses.clip_start)
         made[:, bone] = z @ filters
         left[:, bone] -= unseen
+    clip = np.repeat(np.arange(len(known.poses.clip_start) - 1), np.diff(known.poses.clip_start))
     for part, affinity in enumerate(training.parts.affinity if pose else ()):
         follows, joints = np.flatnonzero(affinity > 0), known.key_joints(part)
-        x, z = (features(posed, joints, dynamics=0.0, lags=[0]) for posed in (known, asked))
+        heavy = joint_weights(known, part, joints)
+        x, z = (features(posed, joints, heavy, dynamics=0.0, lags=[0]) for posed in (known, asked))
         y = left[:, follows].reshape(len(left), -1)
-        rest = kernel.fit(x, y, known.poses.clip_start, width=width, ridge=ridge, tune=True, landmarks=landmarks)
+        rest = kernel.fit(x, y, clip, width=width, ridge=ridge, tune=True, landmarks=landmarks)
         made[:, follows] += affinity[follows, None] * rest(z).reshape(len(z), len(follows), 6)
     bones = asked.decode(from_numbers(made / unit), "residual").astype(np.float32)
     points = skin(training.skinning.rest, training.skinning.weights, bones)

@@ -9,9 +9,10 @@ import numpy as np
 from tasks.errors import InputError
 from tasks.geometry.skinning import skin
 from tasks.motion import kernel
+from tasks.motion.mirror import mirrored
 from tasks.motion.posed import Posed
 from tasks.motion.query import check_poses
-from tasks.motion.regression import features, from_numbers, shape_units, to_numbers
+from tasks.motion.regression import features, from_numbers, joint_weights, shape_units, to_numbers
 from tasks.values import Animation, Poses, Training
 
 
@@ -21,25 +22,26 @@ def animate(
     *,
     represent: Literal["root", "residual"],
     dynamics: float,
-    lag: int,
-    lags: int,
+    reach: int,
     width: float,
     ridge: float,
     tune: bool,
     landmarks: int,
+    mirror: bool,
 ) -> Animation:
-    """Poses -> points: each part's bones by Gaussian kernel ridge regression on its pose, then skinning by W.
+    """Poses -> points: each part's bones by kernel ridge regression on its pose, then skinning by W.
 
     No gradient steps: the database is the model. Matching averages the few frames that come closest; this weighs all.
     represent: regress bones relative to the model's ``root``, or their ``residual`` on skinning of the skeleton.
     dynamics: weight of the root's gravity, velocity, acceleration and angular velocity among the features.
-    lag, lags: features of now and of ``lags`` earlier moments, ``lag`` frames apart.
+    reach: features of now and of 1, 2, 4, ... frames ago, up to so many; 0 for now alone.
     width, ridge, tune, landmarks: see :func:`tasks.motion.kernel.fit`; tuning looks at training clips alone.
+    mirror: learn from the training clips' mirror images as well, where the character is symmetric and, with
+    ``tune``, where that predicts left-out clips better.
     Raises InputError for bad poses (as PartMM) and numbers out of range.
     """
     for name, good, expected, found in (
-        ("lag", lag >= 1, "1 or more frames", lag),
-        ("lags", lags >= 0, "0 or more", lags),
+        ("reach", reach >= 0, "0 or more frames", reach),
         ("width", width > 0, "a positive number", width),
         ("ridge", ridge > 0, "a positive number", ridge),
         ("dynamics", dynamics >= 0, "0 (off) or a positive weight", dynamics),
@@ -49,17 +51,22 @@ def animate(
             raise InputError(f"animate.{name}", expected=expected, found=str(found))
     check_poses(query, training.skeleton, "query")
     known, asked = Posed(training, training.database.poses), Posed(training, query)
-    numbers = to_numbers(known.encode(training.database.bones, represent))
+    image = mirrored(training) if mirror else None
+    learnt = [known] if image is None else [known, Posed(training, image[0], known)]
+    bones = [training.database.bones] if image is None else [training.database.bones, image[1]]
+    numbers = [to_numbers(p.encode(b, represent)) for p, b in zip(learnt, bones, strict=True)]
     unit = shape_units(training)
-    past = [lag * i for i in range(lags + 1)]
-    made = np.zeros((len(asked.world), *numbers.shape[1:]))
+    lags = [0, *(2**i for i in range(reach.bit_length()))]
+    clip = np.repeat(np.arange(len(known.poses.clip_start) - 1), np.diff(known.poses.clip_start))
+    made = np.zeros((len(asked.world), *numbers[0].shape[1:]))
     for part, affinity in enumerate(training.parts.affinity):
-        follows = np.flatnonzero(affinity > 0)
-        joints = known.key_joints(part)
-        x, z = (features(posed, joints, dynamics=dynamics, lags=past) for posed in (known, asked))
-        y = (numbers[:, follows] * unit[follows]).reshape(len(x), -1)
-        model = kernel.fit(x, y, known.poses.clip_start, width=width, ridge=ridge, tune=tune, landmarks=landmarks)
+        follows, joints = np.flatnonzero(affinity > 0), known.key_joints(part)
+        heavy = joint_weights(known, part, joints)
+        *x, z = (features(p, joints, heavy, dynamics=dynamics, lags=lags) for p in (*learnt, asked))
+        y = [(n[:, follows] * unit[follows]).reshape(len(n), -1) for n in numbers]
+        more = (x[1], y[1]) if len(x) > 1 else None
+        model = kernel.fit(x[0], y[0], clip, width=width, ridge=ridge, tune=tune, landmarks=landmarks, more=more)
         made[:, follows] += affinity[follows, None] * model(z).reshape(len(z), len(follows), 6) / unit[follows]
-    bones = asked.decode(from_numbers(made), represent).astype(np.float32)
-    points = skin(training.skinning.rest, training.skinning.weights, bones)
-    return Animation(points=points, bones=bones, parts=training.parts.names)
+    answer = asked.decode(from_numbers(made), represent).astype(np.float32)
+    points = skin(training.skinning.rest, training.skinning.weights, answer)
+    return Animation(points=points, bones=answer, parts=training.parts.names)

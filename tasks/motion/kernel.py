@@ -14,48 +14,68 @@ JITTER = 1e-9
 
 @dataclass(frozen=True)
 class Ridge:
-    """y(x) = mean + k(x, centres) coefficients. centres: (M, D); coefficients: (M, Y); mean: (Y,); scale: twice the
-    kernel's squared width."""
+    """y(x) = mean + k(x, centres) coefficients. centres: (M, D); coefficients: (M, Y); mean: (Y,); width: the kernel's,
+    in the unit of x."""
 
     centres: np.ndarray
     coefficients: np.ndarray
     mean: np.ndarray
-    scale: float
+    width: float
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """(F, D) -> (F, Y)."""
-        return self.mean + np.exp(-squared_distances(x, self.centres) / self.scale) @ self.coefficients
+        return self.mean + matern(squared_distances(x, self.centres) / self.width**2) @ self.coefficients
 
 
 def fit(
-    x: np.ndarray, y: np.ndarray, clip_start: np.ndarray, *, width: float, ridge: float, tune: bool, landmarks: int
+    x: np.ndarray,
+    y: np.ndarray,
+    clip: np.ndarray,
+    *,
+    width: float,
+    ridge: float,
+    tune: bool,
+    landmarks: int,
+    more: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Ridge:
-    """Gaussian kernel ridge regression of y (F, Y) on x (F, D).
+    """Kernel ridge regression of y (F, Y) on x (F, D), with Matern's kernel of smoothness 3/2. clip: (F,) of a frame.
 
     width: of the kernel, in units of the median distance between frames; ridge: added to the kernel's diagonal.
     tune: try multiples of both, and a mean of zero beside the training mean, and keep what predicts left-out clips best
     in the least-squares sense (needs two clips).
     landmarks: at most so many frames become centres, evenly taken; the others still count (Nystroem), while tuning
     sees the centres only.
+    more: a second x and y of the same frames, such as their mirror image; with ``tune`` left aside where
+    clips that are left out together with their own image are predicted better without it.
     """
-    chosen = np.unique(np.linspace(0, len(x) - 1, min(landmarks, len(x))).round().astype(int))
-    centres, known = x[chosen], y[chosen]
-    apart = squared_distances(centres, centres)
-    unit = 2.0 * float(np.median(apart[apart > 0])) if (apart > 0).any() else 1.0
-    centred = True
-    if tune and len(clip_start) > 2:
-        clip = np.searchsorted(clip_start, chosen, side="right") - 1
-        width, ridge, centred = _best(apart / unit, known, clip, width, ridge)
+    chosen = _landmarks(len(x), landmarks)
+    apart = squared_distances(x[chosen], x[chosen])
+    unit = float(np.median(apart[apart > 0])) if (apart > 0).any() else 1.0
+    centred, several = True, len(np.unique(clip)) > 1
+    if tune and several:
+        width, ridge, centred = _best(apart / unit, y[chosen], clip[chosen], width, ridge)
+    scale = np.sqrt(unit) * width
+    if more is not None:
+        both = tuple(np.concatenate(pair) for pair in zip((x, y), more, strict=True))
+        if not (tune and several) or _gains(x, y, *both, clip, scale, ridge, centred, landmarks):
+            x, y = both
+            chosen = _landmarks(len(x), landmarks)
+    centres = x[chosen]
     mean = y.mean(0) if centred else np.zeros(y.shape[1])
-    scale = unit * width**2
-    inner = np.exp(-apart / scale)
+    inner = matern(squared_distances(centres, centres) / scale**2)
     if len(chosen) == len(x):
         left, right = inner + ridge * np.eye(len(x)), y - mean
     else:
-        cross = np.exp(-squared_distances(centres, x) / scale)
+        cross = matern(squared_distances(centres, x) / scale**2)
         left, right = cross @ cross.T + ridge * inner, cross @ (y - mean)
     left[np.diag_indices_from(left)] += JITTER * np.trace(left) / len(left)
     return Ridge(centres, cho_solve(cho_factor(left), right), mean, scale)
+
+
+def matern(squared: np.ndarray) -> np.ndarray:
+    """Matern's kernel of smoothness 3/2 of squared distances in units of its width: (1 + sqrt 3 r) exp(-sqrt 3 r)."""
+    r = np.sqrt(3.0 * squared)
+    return (1.0 + r) * np.exp(-r)
 
 
 def squared_distances(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -63,8 +83,11 @@ def squared_distances(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.maximum((a * a).sum(1)[:, None] + (b * b).sum(1) - 2.0 * a @ b.T, 0.0)
 
 
-def left_out_errors(inverse: np.ndarray, y: np.ndarray, clip: np.ndarray, centred: bool) -> float:
-    """Sum of squared errors of the regression on every clip when trained without it, in closed form.
+def left_out_errors(
+    inverse: np.ndarray, y: np.ndarray, clip: np.ndarray, centred: bool, asked: int | None = None
+) -> float:
+    """Sum of squared errors of the regression on every clip when trained without it, in closed form; of the first
+    ``asked`` rows alone where given.
 
     inverse: Q = (K + ridge I)^-1; leaving a block c out leaves the error Q_cc^-1 (Q (y - m))_c, m the mean of the rest.
     """
@@ -73,15 +96,30 @@ def left_out_errors(inverse: np.ndarray, y: np.ndarray, clip: np.ndarray, centre
         mine = clip == c
         mean = y[~mine].mean(0) if centred else np.zeros(y.shape[1])
         error = np.linalg.solve(inverse[np.ix_(mine, mine)], inverse[mine] @ (y - mean))
-        total += float((error**2).sum())
+        total += float((error[np.flatnonzero(mine) < (len(y) if asked is None else asked)] ** 2).sum())
     return total
 
 
 def _best(apart: np.ndarray, y: np.ndarray, clip: np.ndarray, width: float, ridge: float) -> tuple[float, float, bool]:
     best = (np.inf, width, ridge, True)
     for w, r in product(WIDTHS, RIDGES):
-        gram = np.exp(-apart / (width * w) ** 2) + ridge * r * np.eye(len(apart))
+        gram = matern(apart / (width * w) ** 2) + ridge * r * np.eye(len(apart))
         inverse = cho_solve(cho_factor(gram), np.eye(len(gram)))
         for centred in (True, False):
             best = min(best, (left_out_errors(inverse, y, clip, centred), width * w, ridge * r, centred))
     return best[1:]
+
+
+def _landmarks(count: int, most: int) -> np.ndarray:
+    return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int))
+
+
+def _gains(x, y, x_both, y_both, clip, scale, ridge, centred, landmarks) -> bool:
+    """Whether left-out clips are predicted better with the second half of x_both and y_both than with x and y alone."""
+    some = _landmarks(len(x), landmarks // 2)
+    errors = []
+    for a, b, rows in ((x, y, some), (x_both, y_both, np.concatenate([some, len(x) + some]))):
+        gram = matern(squared_distances(a[rows], a[rows]) / scale**2) + ridge * np.eye(len(rows))
+        inverse = cho_solve(cho_factor(gram), np.eye(len(gram)))
+        errors.append(left_out_errors(inverse, b[rows], clip[rows % len(x)], centred, len(some)))
+    return errors[1] < errors[0]

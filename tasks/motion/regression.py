@@ -11,6 +11,8 @@ from tasks.geometry.rotations import from_rotation_vector, to_rotation_vector
 from tasks.motion.posed import Posed, centroids
 from tasks.values import Training
 
+LEAST = 0.03  # of the heaviest joint's weight: no joint of a part is without a say
+
 
 def to_numbers(frames: np.ndarray) -> np.ndarray:
     """Frames of bones (F, B, 3, 4) -> (F, B, 6): rotation vector in radians, position."""
@@ -22,17 +24,26 @@ def from_numbers(numbers: np.ndarray) -> np.ndarray:
     return rigid.make(from_rotation_vector(numbers[..., :3]), numbers[..., 3:])
 
 
-def features(posed: Posed, joints: np.ndarray, *, dynamics: float, lags: list[int]) -> np.ndarray:
+def features(posed: Posed, joints: np.ndarray, weights: np.ndarray, *, dynamics: float, lags: list[int]) -> np.ndarray:
     """What a pose looks like to a regression, (F, D) float64.
 
-    The rotation matrices of the joints, divided by sqrt(2 n) so that distances are about the root mean square angle
-    between the poses in radians, and the root's dynamics, ``dynamics`` times as heavy as in matching; each of now and
-    of every lag (frames back; before a clip's first frame, that frame).
+    The rotation matrices of the joints, weighted so that squared distances are about the mean squared angle between the
+    poses in radians, each joint by its share of ``weights``; and the root's dynamics, ``dynamics`` times as heavy as in
+    matching; each of now and of every lag (frames back; before a clip's first frame, that frame).
     """
-    turns = posed.poses.rotations[:, joints].reshape(len(posed.world), -1).astype(np.float64)
-    now = np.concatenate([turns / np.sqrt(2 * len(joints)), dynamics * posed.dynamics.reshape(len(turns), -1)], axis=1)
+    heavy = np.sqrt(weights / (2.0 * weights.sum()))[:, None, None]
+    turns = (heavy * posed.poses.rotations[:, joints]).reshape(len(posed.world), -1)
+    now = np.concatenate([turns, dynamics * posed.dynamics.reshape(len(turns), -1)], axis=1)
     back = [np.maximum(np.arange(b - a)[:, None] - np.array(lags), 0) + a for a, b in pairwise(posed.poses.clip_start)]
     return now[np.concatenate(back)].reshape(len(now), -1) / np.sqrt(len(lags))
+
+
+def joint_weights(posed: Posed, part: int, joints: np.ndarray) -> np.ndarray:
+    """How much the poses of a part's joints say of its bones: the root of the skin that they share. (J of the part,)"""
+    skinning = posed.training.skinning
+    share = posed.training.parts.affinity[part] * skinning.weights.astype(np.float64).mean(0)
+    weight = np.sqrt((share @ posed.affinity)[joints])
+    return np.maximum(weight, LEAST * weight.max()) if weight.max() > 0 else np.ones(len(joints))
 
 
 def bone_radii(rest: np.ndarray, weights: np.ndarray) -> np.ndarray:

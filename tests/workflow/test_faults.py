@@ -8,6 +8,9 @@ import hashlib
 import json
 import os
 import pickle
+import random
+import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -53,6 +56,34 @@ def test_fifty_kills_leave_what_an_undisturbed_run_leaves(tmp_path):
     calm = contents(tmp_path / "calm")
     assert len([name for name in calm if name.endswith("meta.json")]) == 3 * CHAINS
     assert contents(tmp_path / "killed") == calm
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name != "posix", reason="kill -9 is POSIX's")
+def test_a_killed_fit_goes_on_and_ends_with_the_same_bits(tmp_path):
+    """Killed twice in the middle of its steps, wherever it is some time after it has kept its state."""
+
+    def start(name: str) -> subprocess.Popen:
+        return subprocess.Popen([sys.executable, "-m", "tests.workflow.killed_fit", str(tmp_path / name)], cwd=ROOT)
+
+    def kept() -> list[int]:
+        """When the killed fit has last kept its state, if ever."""
+        return [path.stat().st_mtime_ns for path in (tmp_path / "killed").rglob("fit.safetensors")]
+
+    assert start("calm").wait(300) == 0
+    shutil.copytree(tmp_path / "calm", tmp_path / "killed", ignore=shutil.ignore_patterns("gaussians"))
+    moment, last = random.Random(0), []
+    for _ in range(2):
+        worker = start("killed")
+        while kept() == last:  # until it has gone on from where the one before was killed
+            assert worker.poll() is None
+            time.sleep(0.01)
+        time.sleep(moment.uniform(0.0, 0.5))
+        worker.kill()
+        assert worker.wait() == -signal.SIGKILL
+        last = kept()
+    assert start("killed").wait(300) == 0
+    assert contents(tmp_path / "killed") == contents(tmp_path / "calm")
 
 
 @pytest.mark.parametrize("shift", [-1e9, 1e9], ids=["back", "forward"])

@@ -41,6 +41,7 @@ def fit(
     neighbours: int,
     carriers: int,
     images_per_knot: float,
+    frames_per_knot: float,
     smooth_weight: float,
     depth: int,
     width: int,
@@ -67,12 +68,13 @@ def fit(
     side; or a ``ball``.
     Curriculum: see :class:`Schedule` for static, grown, coarsest, full (shares).
     Density: ``gaussians`` at the start; every divide_every steps, up to the share divide_until of the iterations, those
-    that are pulled hardest are divided, and the number grows by the share ``growth`` up to max_gaussians.
+    that are pulled hardest are divided, over those that no image needs; the number grows by the share ``growth`` up to
+    max_gaussians.
     sh_degree: 0 to 3. structure, cover: weights of 1 - SSIM (GA eq. 2) and of the alpha's error.
     Rigidity (GA eq. 3 and 4): over ``neighbours`` of ``carriers`` (the nodes; or points spread over the thing, moved by
     the network). ``own``: each carrier's own rotation, ``svd``: the one that fits best; weights for ARAP and for kept
     distances, which fall to the share rigidity_end of themselves.
-    images_per_knot: of the nodes' splines, a knot at most every frame;
+    images_per_knot, frames_per_knot: of the nodes' splines, whichever puts the knots further apart, at least a frame;
     smooth_weight: of the squared second differences of knots. depth, width, skip: the network's; deltas: it
     also changes scale and opacity. rate_…: Adam's, for a thing of about unit size; all fall to the share rate_end.
     averaged: the share of the last iterations of which the mean is the result.
@@ -95,7 +97,9 @@ def _check(recipe: dict) -> None:
     shares = ("hull_agree", "static", "grown", "full", "divide_until", "structure", "averaged", "rigidity_end")
     rules += [(n, 0.0 <= recipe[n] <= 1.0, "a share, 0 to 1") for n in shares]
     rates = [n for n in recipe if n.startswith("rate_")]
-    rules += [(n, recipe[n] > 0, "a positive number") for n in (*rates, "coarsest", "images_per_knot")]
+    rules += [
+        (n, recipe[n] > 0, "a positive number") for n in (*rates, "coarsest", "images_per_knot", "frames_per_knot")
+    ]
     rules += [
         (n, recipe[n] >= 0, "0 or more") for n in ("cover", "arap_weight", "distance_weight", "smooth_weight", "growth")
     ]

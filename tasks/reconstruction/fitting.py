@@ -14,6 +14,7 @@ from tasks.errors import InputError
 from tasks.reconstruction import checkpoint, cuts, density
 from tasks.reconstruction.adam import Adam
 from tasks.reconstruction.curriculum import Schedule, Window
+from tasks.reconstruction.drift import drift
 from tasks.reconstruction.hull import Start, ball_start, hull_start
 from tasks.reconstruction.losses import photometric
 from tasks.reconstruction.mlp import Mlp
@@ -129,7 +130,7 @@ class Fitting:
         loss = sum(terms.values())
         self._check_finite(terms)
         loss.backward()
-        self.pull.add(means.grad)
+        self.pull.add(means.grad, self.params["sh"].grad)
         self.iteration += 1
         for name, value in self.learned().items():
             if value.grad is not None:
@@ -217,10 +218,14 @@ class Fitting:
         solid = torch.sigmoid(self.params["opacities"].detach()) > density.TRANSPARENT
         points = self.params["means"].detach()[solid].cpu().numpy()
         if recipe.deformation == "nodes":
-            self.deformation = Nodes.placed(self._spline(), points, recipe.carriers)
+            self.deformation = Nodes.placed(self._spline(), points, recipe.carriers, self._drift())
         else:
             self.deformation = Mlp.placed(self.capture.times, points, recipe.carriers, recipe.seed, **self._network())
         self._bind()
+
+    def _drift(self) -> np.ndarray:
+        where = drift(self.capture)
+        return ((where - where[self.start.frame]) / self.unit).astype(np.float32)
 
     def _bind(self) -> None:
         if self.deformation is not None:
@@ -232,7 +237,7 @@ class Fitting:
 
     def _spline(self) -> Spline:
         spacing = self.recipe.images_per_knot * len(self.capture.times) / len(self.capture.images)
-        return spline(np.asarray(self.capture.clip_start), max(1.0, spacing))
+        return spline(np.asarray(self.capture.clip_start), max(1.0, spacing, self.recipe.frames_per_knot))
 
     def _next_image(self) -> int:
         """Every image in use once, in random order, then again; while the window grows every other step goes to its
@@ -243,7 +248,7 @@ class Fitting:
                 self.frames = frames
                 for clip, (first, last) in enumerate(frames):
                     if last >= first:
-                        self.deformation.copy_outwards(first, last, clip)
+                        self.deformation.go_on_outwards(first, last, clip)
         if self.iteration % 2 and self.frames:
             edge = self.window.edge(self.frames)
             if len(edge):
@@ -289,7 +294,7 @@ class Fitting:
         tensors |= {f"first.{n}": v for n, v in self.adam.first.items()}
         tensors |= {f"second.{n}": v for n, v in self.adam.second.items()}
         tensors |= {f"mean.{n}": v for n, v in self.mean.items()}
-        arrays = {"pull.total": self.pull.total, "pull.seen": self.pull.seen, "queue": self.queue, "sums": self.sums}
+        arrays = {f"pull.{n}": getattr(self.pull, n) for n in density.SUMS} | {"queue": self.queue, "sums": self.sums}
         if self.deformation is not None:
             tensors["rest"] = self.deformation.rest
         if isinstance(self.deformation, Nodes):
@@ -318,7 +323,8 @@ class Fitting:
                 groups[kind][own] = tensor.to(self.device)
         self.params = {n: groups["param"][n] for n in density.NAMES}
         self.adam.first, self.adam.second, self.mean = groups["first"], groups["second"], groups["mean"]
-        self.pull.total, self.pull.seen = tensors["pull.total"].numpy(), tensors["pull.seen"].numpy()
+        for name in density.SUMS:
+            setattr(self.pull, name, tensors[f"pull.{name}"].numpy())
         self.queue, self.sums = tensors["queue"].numpy(), tensors["sums"].numpy()
         self.iteration, self.history, self.averaged = rest["iteration"], rest["history"], rest["averaged"]
         self.frames = [tuple(f) for f in rest["frames"]]
@@ -331,7 +337,7 @@ class Fitting:
         recipe = self.recipe
         if recipe.deformation == "nodes":
             centres, level = tensors["centres"].numpy(), tensors["level"].numpy()
-            self.deformation = Nodes(self._spline(), centres, level, params["table"].cpu().numpy())
+            self.deformation = Nodes(self._spline(), centres, level, params["table"].cpu().numpy(), self._drift())
             self.deformation.index, self.deformation.weights = tensors["index"], tensors["weights"]
         else:
             self.deformation = Mlp(self.capture.times, tensors["rest"].numpy(), **self._network())

@@ -66,6 +66,7 @@ def collect(store: Store, known: argparse.Namespace, console: Console) -> int:
         for draft in drafts:
             with contextlib.suppress(Timeout), store.lock(draft.parent.name, draft.stem, wait=0):
                 shutil.rmtree(draft, ignore_errors=True)  # one whose lock is held belongs to a run that lives
+        store.sweep_locks()
         console.print(f"removed {said}: {_size(size)} freed", markup=False)
     else:
         console.print(f"{said}: {_size(size)}; add --yes to remove them", markup=False)

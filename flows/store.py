@@ -12,12 +12,12 @@ import json
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 import numpy as np
-from filelock import FileLock
+from filelock import FileLock, Timeout
 from safetensors import SafetensorError
 from safetensors.numpy import load as load_safetensors
 from safetensors.numpy import save as save_safetensors
@@ -106,7 +106,8 @@ class Store:
 
     @contextmanager
     def lock(self, stage: str, key: str, wait: float = -1) -> Iterator[None]:
-        """Holds the artefact's lock. It belongs to the process and dies with it, so no crash leaves it behind.
+        """Holds the artefact's lock. It belongs to the process and dies with it, so no crash leaves it behind; its file
+        stays until :meth:`sweep_locks`.
 
         wait: seconds to wait for another holder before filelock's Timeout is raised; -1 for as long as it takes.
         """
@@ -119,6 +120,15 @@ class Store:
             yield
         finally:
             lock.release()
+
+    def sweep_locks(self) -> None:
+        """Removes the lock files that nobody holds.
+
+        Safe beside runs: only who holds a file removes it, and filelock tells whoever waited for it to open a new one.
+        """
+        for file in sorted(self.path.glob("*/*.lock")):
+            with suppress(Timeout, PermissionError), FileLock(file, timeout=0):  # Windows keeps files that are open
+                file.unlink(missing_ok=True)
 
     def find(self, stage: str, key: str) -> Ref | None:
         """The artefact, if it is there with every file at its recorded size."""

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -58,6 +61,8 @@ def test_gc_spares_what_reports_need_and_what_is_young_and_asks_first(kept, caps
     assert there(folder) == {needed.key}
     assert not draft.exists()
     assert Store(folder / "store").find("make", needed.key)
+    assert not list((folder / "store").rglob("*.lock"))
+    assert command(folder, "verify") == 0
 
 
 def test_gc_without_reports_frees_nothing(kept, capsys):
@@ -90,3 +95,31 @@ def test_without_a_store(tmp_path, capsys):
     assert main(["ls", "--store", str(tmp_path / "none")]) == 2
     assert capsys.readouterr().err.count("\n") == 1
     assert not (tmp_path / "none").exists()
+
+
+def test_gc_beside_runs_breaks_no_lock(tmp_path):
+    """Four writers count in a file that only the lock guards, while lock files are removed all the time."""
+    store, counter, ended = Store(tmp_path / "store"), tmp_path / "count", threading.Event()
+    counter.write_text("0")
+
+    def count() -> None:
+        for _ in range(6):
+            with Store(store.path).lock("stage", "k"):
+                seen = int(counter.read_text())
+                time.sleep(0.0005)
+                counter.write_text(str(seen + 1))
+
+    def sweep() -> None:
+        while not ended.is_set():
+            store.sweep_locks()
+            time.sleep(0.002)
+
+    with ThreadPoolExecutor(5) as pool:
+        sweeping, writers = pool.submit(sweep), [pool.submit(count) for _ in range(4)]
+        failures = [writer.exception(timeout=60) for writer in writers]
+        ended.set()
+        sweeping.result(timeout=60)
+    assert failures == [None] * 4
+    assert counter.read_text() == "24"
+    store.sweep_locks()
+    assert not list(store.path.rglob("*.lock"))

@@ -180,10 +180,12 @@ class Canonical:
 @dataclass(frozen=True)
 class Clusters:
     """Rigid motion clusters. labels: (N,) int32 in 0..B-1; transforms: (F, B, 3, 4);
+    sound: (N,) bool, False for stray points that must not move bones;
     curve_count, curve_error: the counts tried and the vertex RMSE at each (the automatic choice, for the report)."""
 
     labels: np.ndarray
     transforms: np.ndarray
+    sound: np.ndarray
     curve_count: np.ndarray
     curve_error: np.ndarray
 

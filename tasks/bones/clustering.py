@@ -21,6 +21,7 @@ from tasks.geometry.measure import diagonal
 from tasks.values import Canonical, Clusters, Motion
 
 _SAMPLE = 2000  # points clustered; all points are then assigned to the clusters found
+_FRAMES = 48  # frames that they are clustered by, spread over all; more find no better clusters
 _COMPRESSION = 2e-3  # error allowed to the compressed paths, relative to the shape's extent: clusters are far coarser
 _SEED_POINTS = 12  # points a new cluster starts from
 _LEAST = 3  # points below which a cluster has no rigid motion of its own
@@ -53,7 +54,9 @@ def cluster(
     good = np.nonzero(sound)[0]
     sample = np.sort(rng.choice(good, min(len(good), _SAMPLE), replace=False))
     extent = diagonal(canonical.points[sample])
-    paths = compress(train.points, canonical.points, tolerance=_COMPRESSION * extent, sample=sample)
+    frames = np.unique(np.linspace(0, train.frames - 1, min(train.frames, _FRAMES)).round().astype(int))
+    some = train.points if len(frames) == train.frames else train.points[frames]
+    paths = compress(some, canonical.points, tolerance=_COMPRESSION * extent, sample=sample)
     part = paths.take(sample)
     floor = exact * extent
     labels = split(part, np.zeros(len(sample), np.int32), min(max_bones, len(sample) // _LEAST), rounds, floor)
@@ -62,7 +65,8 @@ def cluster(
         chosen = choose_count(counts, errors, len(sample), slack, floor)
         labels = _reassign(part, states[chosen], _POLISH)
     found = _all_points(paths, part, labels, sound)
-    return Clusters(found, rigid_transforms(train.points, canonical.points, found, sound), counts, errors)
+    moved = rigid_transforms(train.points, canonical.points, found, sound)
+    return Clusters(found, moved, sound, counts, errors)
 
 
 def choose_count(counts: np.ndarray, errors: np.ndarray, points: int, slack: float, floor: float) -> int:

@@ -17,7 +17,6 @@ from scipy.spatial import cKDTree
 from tasks.bones import transforms, weights
 from tasks.bones.clustering import split
 from tasks.bones.graph import Graph, moving_together
-from tasks.bones.stray import trusted
 from tasks.bones.trajectories import Trajectories, compress
 from tasks.errors import InputError
 from tasks.geometry.measure import vertex_rmse
@@ -68,7 +67,7 @@ def ssdr(
     """
     _check(influences, surplus, iterations, points_per_bone, prune)
     rng = np.random.default_rng(seed)
-    sound = trusted(train.points, canonical.points, canonical.faces)
+    sound = clusters.sound
     good = np.nonzero(sound)[0]
     wanted = int(clusters.labels.max()) + 1
     size = min(len(good), max(_SPAN, points_per_bone * wanted))

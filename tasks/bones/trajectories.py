@@ -6,6 +6,7 @@ need only products of paths with bone motions, so a path is replaced by its P co
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -17,6 +18,7 @@ from tasks.geometry import rigid
 from tasks.geometry.parallel import for_chunks
 
 _BLOCK = 32  # vectors added to the basis at a time
+_JUDGES = 500  # points from which the global motion is taken
 _TILE = 16  # points whose coefficients are kept in the first-level cache
 
 
@@ -105,8 +107,9 @@ def align(points: np.ndarray, canonical: np.ndarray, sample: np.ndarray) -> Alig
 
     The centre is a median and the scale is capped by one, so that a few stray points cannot shrink the shape to a dot.
     """
-    chosen = np.asarray(canonical[sample], np.float64)
-    motion = rigid.procrustes(chosen, points[:, sample])
+    judges = sample[:: math.ceil(len(sample) / _JUDGES)]
+    chosen = np.asarray(canonical[judges], np.float64)
+    motion = rigid.procrustes(chosen, points[:, judges])
     centre = np.median(chosen, axis=0)
     distance = np.linalg.norm(chosen - centre, axis=1)
     scale = min(float(np.sqrt(np.mean(distance**2))), 3.0 * float(np.median(distance)))

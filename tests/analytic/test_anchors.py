@@ -53,7 +53,7 @@ def test_gaussian_bones_give_far_blobs_their_own_bone():
     a, left = turning(points, 6)
     right = rigid.make(np.repeat(np.eye(3)[None], 6, 0), np.linspace(0, 1, 6)[:, None] * [0, 1.0, 0])
     moved = np.where(labels[:, None] == 0, a, rigid.apply(right[:, None], points))
-    clusters = Clusters(labels, np.stack([left, right], 1), np.zeros(0), np.zeros(0))
+    clusters = Clusters(labels, np.stack([left, right], 1), np.ones(len(labels), bool), np.zeros(0), np.zeros(0))
     canonical = Canonical(points.astype(np.float32), None, 0, "first")
     found = gaussian_bones(motion(moved, None), canonical, clusters, sharpness=1.0, influences=2)
     np.testing.assert_allclose(found.weights.sum(1), 1, atol=1e-6)

@@ -193,7 +193,7 @@ def test_spread_shares_points_with_their_neighbours() -> None:
     labels = (points[:, 0] > 0).astype(np.int32)
     transforms = random_transforms(rng, 4, 2).astype(np.float32)
     motion = motion_of(rigid.apply(transforms[:, labels], points))
-    clusters = Clusters(labels, transforms, np.array([2]), np.array([0.0]))
+    clusters = Clusters(labels, transforms, np.ones(len(labels), bool), np.array([2]), np.array([0.0]))
     hard = rigid_skinning(motion, canonical_of(points), clusters, spread=0)
     soft = rigid_skinning(motion, canonical_of(points), clusters, spread=5)
     assert hard.history[-1] < 1e-6 < soft.history[-1]

@@ -280,5 +280,7 @@ def test_figures_of_surfaces_and_of_bare_points(walker):
 
 
 def test_the_chosen_count_is_marked():
-    clusters = Clusters(np.zeros(4, np.int32), np.zeros((2, 3, 3, 4)), np.array([1, 2, 3]), np.array([0.4, 0.2, 0.1]))
+    clusters = Clusters(
+        np.zeros(4, np.int32), np.zeros((2, 3, 3, 4)), np.ones(4, bool), np.array([1, 2, 3]), np.array([0.4, 0.2, 0.1])
+    )
     assert "chosen: 3" in figures.count_figure(clusters, 2.0)

@@ -63,7 +63,7 @@ class Progress:
 
     def note(self, text: str) -> None:
         """A remark that the user should see."""
-        self.console.print(Text(f"  {text}", "yellow"))
+        self._print(Text(f"  {text}", "yellow"))
 
     def finish(self, tables: list, folder: Path, computed: int) -> None:
         """The tables, and where the report lies."""
@@ -71,7 +71,8 @@ class Progress:
             self.console.print()
             self.console.print(table)
         how = "nothing was computed, all was cached" if not computed else f"{computed} of {self.total} stages computed"
-        self.console.print(f"\n{how}; {time.monotonic() - self._start:.1f} s; report in {folder}")
+        self.console.print()
+        self._print(f"{how}; {time.monotonic() - self._start:.1f} s; report in {folder}")
 
     def _line(self, node: Node, how: Text, rest: str) -> None:
         with self._lock:
@@ -79,7 +80,11 @@ class Progress:
         self.tell(node)
         more = f" (+{len(node.cases) - 1} cases)" if len(node.cases) > 1 else ""
         count = f"[{self.finished:{len(str(self.total))}}/{self.total}] "
-        self.console.print(Text.assemble((count, "dim"), how, f" {node.stage:<10} {node.cases[0]}{more}", rest))
+        self._print(Text.assemble((count, "dim"), how, f" {node.stage:<10} {node.cases[0]}{more}", rest))
+
+    def _print(self, text: str | Text) -> None:
+        """One line, however long: a command or a path that is cut in two can be neither copied nor searched for."""
+        self.console.print(text, soft_wrap=True)
 
     def _now(self) -> Table:
         self._poll()

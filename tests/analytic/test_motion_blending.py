@@ -11,6 +11,7 @@ from tasks.geometry import rigid
 from tasks.geometry.rotations import from_rotation_vector, project_so3, to_quaternion
 from tasks.motion.blending import PartMotion, Sources, blend, level_shares, window_weights
 from tasks.motion.dynamics import root_dynamics
+from tasks.motion.matching import _strides
 from tasks.motion.posed import Posed, centroids
 from tasks.motion.projection import mean_turn, project
 from tests.analytic import planted
@@ -109,7 +110,30 @@ def test_dynamics_of_a_falling_spinning_root():
     np.testing.assert_allclose(got[:, 3], np.tile(spin, (frames, 1)), atol=1e-9)
 
 
+def test_angular_velocity_is_central_where_a_spin_speeds_up():
+    fps, frames = 50.0, 20
+    time = np.arange(frames) / fps
+    rotation = from_rotation_vector(3.0 * time[:, None] ** 2 * np.array([0.0, 0.0, 1.0]))  # 6 t rad/s
+    root = rigid.make(rotation, np.zeros((frames, 3)))
+    got = root_dynamics(root, np.zeros(3), np.array([0, frames]), fps)[:, 3, 2]
+    np.testing.assert_allclose(got[1:-1], 6.0 * time[1:-1], atol=1e-9)
+
+
 def test_dynamics_do_not_reach_over_a_cut():
     root = rigid.identity(6, dtype=float)
     root[3:, 0, 3] = 100.0  # a jump exactly at the cut
     assert np.all(root_dynamics(root, np.zeros(3), np.array([0, 3, 6]), 30.0)[:, 1:] == 0)
+
+
+@pytest.mark.parametrize("patch", [1, 3, 7])
+def test_the_coarsest_windows_still_reach_every_frame(patch):
+    """min(levels, 1 + floor(log2(F / p))) levels (eq. 10): windows fit into the clip, and none of its frames is left
+    out between them."""
+    for frames in range(patch, 150):
+        strides = _strides(frames, patch, 5)
+        assert strides == sorted((2**i for i in range(len(strides))), reverse=True)
+        assert 2 ** (len(strides) - 1) * patch <= frames
+        assert len(strides) == 5 or 2 ** len(strides) * patch > frames
+        for stride in strides:
+            first = np.arange(frames - (patch - 1) * stride)
+            assert len(np.unique(first[:, None] + stride * np.arange(patch))) == frames

@@ -32,6 +32,13 @@ def test_training_frames_are_their_own_sources_and_nothing_lies_farther_than_a_w
     assert wild.expected.min() > np.median(same.expected)
 
 
+def test_a_frame_is_judged_by_the_window_with_it_in_the_middle(train):
+    """30 frames of training and then wild ones: with windows of 5, the first 28 frames see none of the wild."""
+    mixed = np.concatenate([CLIPS[0][:30], planted.gesture(30, 9, 2.0)])
+    nearest = confidence(train, planted.poses([mixed]), **SETTINGS).distance[:, :, 0]
+    assert nearest[:28].max() < 1e-5 < nearest[28:].min()
+
+
 def test_it_is_calibrated_by_clips_left_out(train):
     """Motions of the training's own kind spread over the whole scale."""
     query = planted.poses([planted.gesture(60, seed, 0.4) for seed in range(20, 28)])

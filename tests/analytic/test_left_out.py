@@ -47,6 +47,14 @@ def test_every_clip_is_left_out_once_and_asked_for(train, unseen):
         np.testing.assert_array_equal(asked.clip_start, truth.clip_start)
 
 
+def test_fewer_runs_than_clips_take_clips_that_lie_evenly(unseen):
+    clips = [planted.gesture(10, seed) for seed in range(4)]
+    train, query = planted.training(clips), planted.poses([UNSEEN])
+    for run, clip in enumerate(("clip0", "clip2")):
+        truth = leave_out(train.motion, unseen, train.skinning, planted.poses(clips), query, run=run, runs=2)[-1]
+        assert truth.clip_names[-1] == f"{clip} (left out)"
+
+
 def test_one_long_clip_gives_up_stretches(train, unseen):
     motion = train.motion.take_frames([slice(0, 90)], ["all"])
     poses = planted.poses([A, B, C])

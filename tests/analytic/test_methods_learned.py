@@ -96,6 +96,19 @@ def test_left_out_errors_are_those_of_training_without_the_clip():
         assert np.isclose(kernel.left_out_errors(inverse, y, clip, centred), total)
 
 
+def test_landmarks_minimise_the_ridge_over_all_frames():
+    """sum |y - m - k(x, centres) c|^2 + ridge c^T k(centres, centres) c has no slope at its coefficients (Nystroem)."""
+    rng = np.random.default_rng(3)
+    x, y = rng.normal(size=(80, 3)), rng.normal(size=(80, 2))
+    ridge = 0.5
+    found = kernel.fit(x, y, np.zeros(80), width=1.0, ridge=ridge, tune=False, landmarks=20)
+    apart = (kernel.squared_distances(found.centres, z) / found.width**2 for z in (found.centres, x))
+    inner, cross = map(kernel.matern, apart)
+    slope = cross @ (cross.T @ found.coefficients - (y - found.mean)) + ridge * inner @ found.coefficients
+    assert np.abs(slope).max() < 1e-5 * np.abs(cross @ (y - found.mean)).max()
+    np.testing.assert_allclose(found(x), found.mean + cross.T @ found.coefficients, atol=1e-9)
+
+
 def test_tuning_finds_that_noise_holds_nothing():
     rng = np.random.default_rng(2)
     x, y = rng.normal(size=(90, 4)), rng.normal(size=(90, 3))

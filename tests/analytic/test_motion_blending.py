@@ -137,3 +137,19 @@ def test_the_coarsest_windows_still_reach_every_frame(patch):
         for stride in strides:
             first = np.arange(frames - (patch - 1) * stride)
             assert len(np.unique(first[:, None] + stride * np.arange(patch))) == frames
+
+
+def test_dynamics_count_in_the_body_s_own_size():
+    """A character ten times as large that does the same is no different to matching."""
+    train = planted.training([planted.gesture(30, 1)])
+    known = train.database.poses
+    larger = replace(
+        train,
+        canonical=replace(train.canonical, points=10 * train.canonical.points),
+        skeleton=replace(train.skeleton, joints=10 * train.skeleton.joints),
+        skinning=replace(train.skinning, rest=10 * train.skinning.rest),
+    )
+    moved = replace(known, translations=10 * known.translations)
+    found = Posed(larger, moved).dynamics
+    np.testing.assert_allclose(found, Posed(train, known).dynamics, rtol=1e-4, atol=1e-5)
+    assert np.abs(found[:, 1:]).max((0, 2)).min() > 1e-3  # and none of them is zero

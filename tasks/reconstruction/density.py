@@ -1,4 +1,4 @@
-"""Where Gaussians are: those that no image needs move to where the images pull hardest, and their number grows."""
+"""Where Gaussians are: transparent ones move to where the images pull hardest, and their number grows."""
 
 from __future__ import annotations
 
@@ -8,49 +8,40 @@ import torch
 from tasks.reconstruction.adam import Adam
 
 NAMES = ("means", "log_scales", "opacities", "sh")  # parameters with a row for each Gaussian
-SUMS = ("total", "seen", "shown")
 TRANSPARENT = 0.05  # opacity below which a Gaussian does nothing
-HIDDEN = 0.1  # of what the median Gaussian shows: one that shows less lies behind others, off the surface
 SHRINK = 0.75  # scale of both halves of a divided Gaussian: they cover about what it did
 APART = 0.6  # standard deviation of a half's place, in scales
 
 
 class Pull:
-    """How hard the images pull at each Gaussian's place: mean length of the gradient, over the views that see it; and
-    how much of it they show, by the gradient of its colour, which is as large as the area that it has in the image."""
+    """How hard the images pull at each Gaussian's place: mean length of the gradient, over the views that see it."""
 
     def __init__(self, count: int) -> None:
-        self.total, self.seen, self.shown = (np.zeros(count, np.float32) for _ in SUMS)
+        self.total, self.seen = np.zeros(count, np.float32), np.zeros(count, np.float32)
 
-    def add(self, of_means: torch.Tensor, of_sh: torch.Tensor) -> None:
-        """Gradients of the loss, (N, 3) and (N, K, 3)."""
-        length = of_means.norm(dim=1).cpu().numpy()
+    def add(self, gradient: torch.Tensor) -> None:
+        """gradient: (N, 3) of the loss with respect to the means."""
+        length = gradient.norm(dim=1).cpu().numpy()
         self.total += length
         self.seen += length > 0
-        self.shown += of_sh[:, 0].norm(dim=1).cpu().numpy()
 
     def mean(self) -> np.ndarray:
         """(N,)."""
         return self.total / np.maximum(self.seen, 1.0)
 
-    def hidden(self) -> np.ndarray:
-        """Which Gaussians hardly show in any image, (N,)."""
-        return self.shown < HIDDEN * np.median(self.shown)
-
 
 def divide(
     params: dict[str, torch.Tensor], adam: Adam, pull: Pull, most: int, growth: float, rng: np.random.Generator
 ) -> int:
-    """Divides Gaussians that are pulled hard; the second halves take the place of transparent and hidden ones, then of
-    new ones.
+    """Divides Gaussians that are pulled hard; the second halves take the place of transparent ones, then of new ones.
 
     The number grows by the share ``growth`` up to ``most``. Gaussians are drawn with chances as their pull.
     Returns how many were divided.
     """
     with torch.no_grad():
-        needed = (torch.sigmoid(params["opacities"]).cpu().numpy() >= TRANSPARENT) & ~pull.hidden()
-        chance = (pull.mean() * needed).astype(np.float64)
-        count, free = len(needed), np.flatnonzero(~needed)
+        opaque = torch.sigmoid(params["opacities"]).cpu().numpy() >= TRANSPARENT
+        chance = (pull.mean() * opaque).astype(np.float64)
+        count, free = len(opaque), np.flatnonzero(~opaque)
         added = max(0, min(most - count, round(growth * count)))
         wanted = min(len(free) + added, int(np.count_nonzero(chance)))
         if wanted == 0:

@@ -130,7 +130,7 @@ class Fitting:
         loss = sum(terms.values())
         self._check_finite(terms)
         loss.backward()
-        self.pull.add(means.grad, self.params["sh"].grad)
+        self.pull.add(means.grad)
         self.iteration += 1
         for name, value in self.learned().items():
             if value.grad is not None:
@@ -294,7 +294,7 @@ class Fitting:
         tensors |= {f"first.{n}": v for n, v in self.adam.first.items()}
         tensors |= {f"second.{n}": v for n, v in self.adam.second.items()}
         tensors |= {f"mean.{n}": v for n, v in self.mean.items()}
-        arrays = {f"pull.{n}": getattr(self.pull, n) for n in density.SUMS} | {"queue": self.queue, "sums": self.sums}
+        arrays = {"pull.total": self.pull.total, "pull.seen": self.pull.seen, "queue": self.queue, "sums": self.sums}
         if self.deformation is not None:
             tensors["rest"] = self.deformation.rest
         if isinstance(self.deformation, Nodes):
@@ -323,8 +323,7 @@ class Fitting:
                 groups[kind][own] = tensor.to(self.device)
         self.params = {n: groups["param"][n] for n in density.NAMES}
         self.adam.first, self.adam.second, self.mean = groups["first"], groups["second"], groups["mean"]
-        for name in density.SUMS:
-            setattr(self.pull, name, tensors[f"pull.{name}"].numpy())
+        self.pull.total, self.pull.seen = tensors["pull.total"].numpy(), tensors["pull.seen"].numpy()
         self.queue, self.sums = tensors["queue"].numpy(), tensors["sums"].numpy()
         self.iteration, self.history, self.averaged = rest["iteration"], rest["history"], rest["averaged"]
         self.frames = [tuple(f) for f in rest["frames"]]

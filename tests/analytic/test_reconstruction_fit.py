@@ -274,29 +274,13 @@ def test_division_reuses_transparent_gaussians_then_grows():
     }
     params["opacities"][:3] = -5.0
     pull = density.Pull(10)
-    pull.add(torch.ones(10, 3), torch.ones(10, 1, 3))
+    pull.add(torch.ones(10, 3))
     divided = density.divide(params, adam.Adam(), pull, 12, 0.5, np.random.default_rng(0))
     assert divided == 5
     assert len(params["means"]) == 12
     assert (params["opacities"] > 0).all()  # the transparent three took a half each
     assert (params["sh"][:, 0, 0] >= 3).all()
     assert int((params["log_scales"] < 0).sum()) == 10  # both halves are smaller
-
-
-def test_division_takes_the_place_of_what_no_image_shows():
-    params = {
-        "means": torch.arange(10.0)[:, None].repeat(1, 3),
-        "log_scales": torch.full((10, 1), -9.0),
-        "opacities": torch.full((10,), 3.0),
-        "sh": torch.zeros(10, 1, 3),
-    }
-    pull = density.Pull(10)
-    shown = torch.ones(10, 1, 3)
-    shown[4] = 0.1
-    pull.add(torch.ones(10, 3), shown)
-    assert pull.hidden().tolist() == [i == 4 for i in range(10)]
-    assert density.divide(params, adam.Adam(), pull, 10, 0.5, np.random.default_rng(0)) == 1
-    assert float((params["means"][4] - 4.0).abs().min()) > 0.5
 
 
 # a whole fit

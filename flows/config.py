@@ -275,8 +275,8 @@ def parse(text: str) -> Override:
     known = groups()
     try:
         override = OverridesParser.create().parse_override(text)
-    except HydraException as error:
-        raise InputError(text, expected="KEY=VALUE", found=_first_line(error)) from None
+    except (HydraException, ValueError) as error:  # ValueError: of a number too long to be read
+        raise InputError(_short(text), expected="KEY=VALUE", found=_first_line(error)) from None
     name = override.key_or_group
     if name in ADDED and not override.is_add():
         raise InputError(text, expected=f"+{text}", found=text, do="an experiment or ablation is added with a plus")
@@ -357,6 +357,10 @@ def _plain(config: DictConfig) -> dict:
 
 def _plus(override: Override) -> str:
     return "+" if override.is_add() else ""
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= 200 else f"{text[:200]}…"
 
 
 def _first_line(error: Exception) -> str:

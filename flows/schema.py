@@ -118,6 +118,7 @@ DECIDING = {  # what the rest of the schema hangs on, beside the pipeline
     **dict.fromkeys(("dataset", "bones", "skeleton", "reconstruction", "runner"), "kind"),
     "animate": "function",
 }
+LARGEST = 1e30  # of a setting's size: its square is still a number
 UNIONS = (types.UnionType, typing.Union)  # of A | B, and of one in which a Literal is
 RENAMED = {"lambda_": "lambda"}  # Python keywords that are the field's names in the config
 
@@ -329,10 +330,14 @@ def _typed(value: object, kind: object, path: str) -> object:
         if isinstance(value, list):
             return [_typed(v, typing.get_args(kind)[0], f"{path}[{i}]") for i, v in enumerate(value)]
     elif kind is float and isinstance(value, int | float) and not isinstance(value, bool):
-        return float(value)
+        if abs(value) <= LARGEST:  # not for nan
+            return float(value)
     elif kind is str and isinstance(value, int | float) and not isinstance(value, bool):
         return str(value)  # a file or a clip may be called 7
-    elif isinstance(value, kind) and (kind is bool or not isinstance(value, bool)):
+    elif kind is int and isinstance(value, int) and not isinstance(value, bool):
+        if abs(value) < 2**63:  # what numpy holds
+            return value
+    elif kind in (str, bool) and isinstance(value, kind):
         return value
     raise InputError(path, expected=describe(kind), found=f"{value!r}")
 
@@ -345,4 +350,4 @@ def describe(kind: object) -> str:
         return " or ".join("null" if m is type(None) else describe(m) for m in typing.get_args(kind))
     if typing.get_origin(kind) is list:
         return f"a list, each entry {describe(typing.get_args(kind)[0])}"
-    return {int: "a whole number", float: "a number", str: "text", bool: "true or false"}[kind]
+    return {int: "a whole number", float: "a finite number", str: "text", bool: "true or false"}[kind]

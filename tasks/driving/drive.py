@@ -197,6 +197,14 @@ def _read_npz(path: Path) -> Driver:
     if not fits or moved.shape != rotations.shape[:3]:
         shapes = ", ".join(str(a.shape) for a in (parents, joints, rotations, moved))
         raise InputError(str(path), expected=f"arrays of {count} joints", found=shapes)
+    if parents[0] != -1 or not all(0 <= p < j for j, p in enumerate(parents[1:], start=1)):
+        expected = "one root at index 0 and every parent before its children"
+        raise InputError(f"{path}: joint_parents", expected=expected, found=str(parents.tolist()))
+    for name, array in (("joints", joints), ("joint_translations", moved), ("fps", fps)):
+        if array.dtype.kind not in "fiu" or not np.isfinite(array).all():
+            raise InputError(f"{path}: {name}", expected="finite numbers", found="others")
+    if fps.size != 1 or not fps > 0:
+        raise InputError(f"{path}: fps", expected="one number above zero", found=str(fps.tolist()))
     off = np.abs(np.swapaxes(rotations, -1, -2) @ rotations - np.eye(3)).max((-1, -2))
     if not (off <= 1e-3).all() or (np.linalg.det(rotations) < 0).any():
         f, j = np.unravel_index(int(np.nanargmax(np.where(np.isfinite(off), off, np.inf))), off.shape)

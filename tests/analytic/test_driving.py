@@ -123,6 +123,15 @@ def test_another_rest_pose_and_size_are_brought_into_line(tmp_path):
     np.testing.assert_allclose(kinematics.joint_positions(turned, hanging), motion.points, atol=1e-6)
 
 
+def test_a_driver_that_looks_elsewhere_at_rest_turns_the_character(tmp_path):
+    """Two bones that leave the hips decide which way the driver looks."""
+    aside = (T_POSE @ from_rotation_vector(np.array([0.0, 1.2, 0.0])).T).astype(np.float32)
+    still = Poses(np.tile(np.eye(3, dtype=np.float32), (2, 6, 1, 1)), np.zeros((2, 6, 3), np.float32), np.array([0, 2]))
+    (tmp_path / "t.bvh").write_text(bvh.write_bvh(skeleton(aside), still, slice(0, 2), fps=FPS))
+    motion, _, _ = drive(tmp_path / "t.bvh")
+    np.testing.assert_allclose(motion.points[0] - motion.points[0, 0], aside - aside[0], atol=1e-4)
+
+
 def test_joints_without_a_counterpart_stay_at_rest_and_are_named(tmp_path):
     (tmp_path / "w.bvh").write_text(bvh.write_bvh(skeleton(), walk(), slice(0, 40), fps=FPS))
     odd = Skeleton(
@@ -169,6 +178,9 @@ def test_bad_files_and_names(tmp_path):
         ({"joint_rotations": 2 * arrays["joint_rotations"]}, ("joint_rotations", "rotation matrices", "frame 0")),
         ({"joint_rotations": arrays["joint_rotations"][:, :4]}, ("arrays of 6 joints",)),
         ({"joints": None}, ("add joints",)),
+        ({"joints": arrays["joints"] * np.nan}, ("joints", "finite numbers")),
+        ({"joint_parents": arrays["joint_parents"][::-1]}, ("joint_parents", "every parent before")),
+        ({"fps": np.array(0.0)}, ("fps", "above zero")),
     ):
         np.savez(tmp_path / "bad.npz", **{n: a for n, a in (arrays | change).items() if a is not None})
         rejects(lambda: drive(tmp_path / "bad.npz"), "bad.npz", *words)

@@ -224,7 +224,8 @@ class Fitting:
         self._bind()
 
     def _drift(self) -> np.ndarray:
-        where = drift(self.capture)
+        """What the splines can say of it, so that they can also take it back."""
+        where = self._spline().smoothed(drift(self.capture))
         return ((where - where[self.start.frame]) / self.unit).astype(np.float32)
 
     def _bind(self) -> None:

@@ -139,6 +139,14 @@ def test_splines_follow_a_line_exactly():
     np.testing.assert_allclose(np.diff(values), 5 / 20, atol=1e-5)
 
 
+def test_smoothing_leaves_a_spline_as_it_is_and_takes_out_the_rest():
+    along = np.arange(30.0)[:, None] * np.array([1.0, -2.0, 0.5])
+    made = spline(np.array([0, 30]), 5.0)
+    np.testing.assert_allclose(made.smoothed(along), along, atol=1e-5)
+    jitter = 0.5 * (-1.0) ** np.arange(30)[:, None]
+    assert np.abs(made.smoothed(along + jitter) - along)[3:-3].max() < 0.25
+
+
 def test_nodes_at_rest_move_nothing_and_the_coarsest_moves_all():
     points = np.random.default_rng(0).normal(size=(400, 3)).astype(np.float32)
     nodes = Nodes.placed(spline(np.array([0, 10]), 5.0), points, 64, np.zeros((10, 3), np.float32))

@@ -22,6 +22,8 @@ def animate(
     align: bool,
     dynamics: float,
     shrink: bool,
+    mirror: bool,
+    sources: int,
 ) -> Animation:
     """Poses -> points by partwise motion matching (GaussiAnimate 3.3, eq. 7-10 and alg. 1), then skinning by W.
 
@@ -35,11 +37,14 @@ def animate(
     dynamics: weight of gravity, velocity, acceleration and angular velocity of the root in the key; 0 is the paper's.
     shrink: take as much of each bone's residual as proved right when training clips were matched against each other
     (``residual``).
+    mirror: match the training clips' mirror images as well, where the character is symmetric.
+    sources: instead of the mean of windows, blend as many training frames, those whose pose with its past comes
+    nearest, by the shares that predict the query's pose from theirs (:mod:`tasks.motion.affine`); 0 is the paper's.
 
     Clips of the query shorter than a patch are padded with their last pose. Raises InputError for poses of another
     skeleton, matrices that are no rotations, training clips all shorter than a patch and numbers out of range.
     """
-    way = Way(k, patch, levels, lambda_, temperature, represent, align, dynamics, shrink)
+    way = Way(k, patch, levels, lambda_, temperature, represent, align, dynamics, shrink, mirror, sources)
     found = match(training, query, way)
     points = skin(training.skinning.rest, training.skinning.weights, found.bones)
     return Animation(

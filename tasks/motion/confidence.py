@@ -76,7 +76,7 @@ def _look(
     windows, distance = [], []
     for part in range(len(known.training.parts.names)):
         keys = asked.keys(part, dynamics), known.keys(part, dynamics)
-        found = nearest_windows(*keys, k=k, patch=patch, strides=[1], skip=skip)
+        found = nearest_windows(*keys, k=k, patch=patch, strides=[1], skip=() if skip is None else (skip,))
         near, first = found.distance[0][at], found.start[0][at]
         few = first < 0  # a small database has fewer windows: the nearest stands for those that it lacks
         distance.append(np.where(few, near[:, :1], near))

@@ -10,11 +10,13 @@ import numpy as np
 
 from tasks.errors import InputError
 from tasks.geometry import rigid
+from tasks.motion.affine import Space, describe, nearest_moments, space
 from tasks.motion.blending import PartMotion, Sources, blend, gather, strongest
+from tasks.motion.mirror import with_image
 from tasks.motion.posed import Posed
 from tasks.motion.projection import project
 from tasks.motion.query import check_poses
-from tasks.motion.regression import bone_radii, from_numbers, to_numbers
+from tasks.motion.regression import bone_radii, from_numbers, joint_weights, to_numbers
 from tasks.motion.search import nearest_windows
 from tasks.values import Poses, Training
 
@@ -32,6 +34,8 @@ class Way:
     align: bool
     dynamics: float
     shrink: bool
+    mirror: bool
+    sources: int
 
     def __post_init__(self) -> None:
         for name, good, expected in (
@@ -41,6 +45,7 @@ class Way:
             ("lambda_", 0 < self.lambda_ <= 1, "a number in (0, 1]"),
             ("temperature", self.temperature > 0, "a positive number"),
             ("dynamics", self.dynamics >= 0, "0 (off) or a positive weight"),
+            ("sources", self.sources >= 0, "0 (softmax) or how many"),
             ("represent", self.represent in ("root", "part", "residual"), "root, part or residual"),
         ):
             if not good:
@@ -48,6 +53,8 @@ class Way:
         if self.shrink and self.represent != "residual":
             expected = "false without represent=residual (there is nothing to shrink towards)"
             raise InputError("animate.shrink", expected=expected, found="true")
+        if self.shrink and self.sources:
+            raise InputError("animate.shrink", expected="false with sources (they are not shrunk)", found="true")
 
 
 @dataclass(frozen=True)
@@ -62,27 +69,35 @@ class Matched:
 @dataclass(frozen=True)
 class PartStore:
     """What a part's blend takes from the database. follows: (M,) its bones; affinity: (M,) how much they follow;
-    values: (F, M, 3, 4) in the part's frame; motion: its joints in the training frames."""
+    values: (F, M, 3, 4) in the part's frame; motion: its joints in the training frames; heavy: (J,) what its joints
+    say of its bones; space: where poses are compared for their shares, or None for a softmax."""
 
     follows: np.ndarray
     affinity: np.ndarray
     values: np.ndarray
     motion: PartMotion
+    heavy: np.ndarray
+    space: Space | None
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """A database ready to be matched. known: the training poses; parts: one store each; keep: (B,) share of the matched
-    residuals to believe, or None for all of it."""
+    """A database ready to be matched. known: the training poses, and after them their mirror image where wanted;
+    parts: one store each; frames: those that are no images; keep: (B,) share of the matched residuals to believe, or
+    None for all of it."""
 
     known: Posed
     way: Way
     parts: tuple[PartStore, ...]
+    frames: int
     keep: np.ndarray | None = None
 
 
 def prepare(training: Training, way: Way) -> Prepared:
     """The database as queries need it. Raises InputError where every training clip is shorter than a patch."""
+    frames = len(training.database.bones)
+    if way.mirror:
+        training = with_image(training)
     known = Posed(training, training.database.poses)
     longest = int(np.diff(known.poses.clip_start).max())
     if longest < way.patch:
@@ -93,8 +108,11 @@ def prepare(training: Training, way: Way) -> Prepared:
     for part, affinity in enumerate(training.parts.affinity):
         follows = np.flatnonzero(affinity > 0)
         mine = known.to_part(values[:, follows], part, way.represent)
-        parts.append(PartStore(follows, affinity[follows], mine, known.part_motion(part, way.represent)))
-    ready = Prepared(known, way, tuple(parts))
+        heavy = joint_weights(known, part, known.key_joints(part))
+        told = space(known.keys(part, way.dynamics), heavy) if way.sources else None
+        moving = known.part_motion(part, way.represent)
+        parts.append(PartStore(follows, affinity[follows], mine, moving, heavy, told))
+    ready = Prepared(known, way, tuple(parts), frames)
     return replace(ready, keep=_reliability(ready, values)) if way.shrink else ready
 
 
@@ -116,19 +134,25 @@ def match_prepared(ready: Prepared, query: Poses) -> Matched:
         length = int(query.clip_start[clip + 1] - query.clip_start[clip])
         done.append([x[:length] for x in (asked.decode(believed(ready, frames), way.represent), sources, distance)])
     bones, sources, distance = (np.concatenate(x) for x in zip(*done, strict=True))
+    sources %= ready.frames  # an image counts as the frame that it is the image of
     return Matched(bones.astype(np.float32), sources, distance.astype(np.float32))
 
 
-def _match_clip(asked: Posed, ready: Prepared, skip: int | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """One clip: frames of bones (F, B, 3, 4), sources (F, P, k), distance (F, P). skip: a training clip left out."""
+def _match_clip(asked: Posed, ready: Prepared, skip: tuple[int, ...] = ()) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """One clip: frames of bones (F, B, 3, 4), sources (F, P, k), distance (F, P). skip: training clips left out."""
     frames, way, known = len(asked.world), ready.way, ready.known
-    lengths = np.delete(np.diff(known.poses.clip_start), [] if skip is None else skip)
+    lengths = np.delete(np.diff(known.poses.clip_start), list(skip))
     strides = _strides(min(frames, int(lengths.max())), way.patch, way.levels)
     rows, distance = [], []
     for part in range(len(ready.parts)):
         keys = asked.keys(part, way.dynamics), known.keys(part, way.dynamics)
         found = nearest_windows(*keys, k=way.k, patch=way.patch, strides=strides, skip=skip)
-        rows.append(gather(found, strides, patch=way.patch, lambda_=way.lambda_, temperature=way.temperature))
+        if way.sources:
+            store = ready.parts[part]
+            told = describe(keys[0], store.heavy) @ store.space.basis
+            rows.append(nearest_moments(told, store.space, way.sources))
+        else:
+            rows.append(gather(found, strides, patch=way.patch, lambda_=way.lambda_, temperature=way.temperature))
         distance.append(_per_frame(found.distance[-1, :, 0], frames, way.patch))
     sources = np.stack([strongest(row, way.k) for row in rows], 1)
     return merged(asked, ready, rows), sources, np.stack(distance, 1)
@@ -163,11 +187,13 @@ def _reliability(ready: Prepared, values: np.ndarray) -> np.ndarray:
     radius = bone_radii(training.skinning.rest, training.skinning.weights)
     unit = np.repeat([radius, np.ones_like(radius)], 3, axis=0).T
     agree, size = np.zeros(len(unit)), np.zeros(len(unit))
-    for clip, (a, b) in enumerate(pairwise(poses.clip_start)):
-        if len(lengths) < 2 or np.delete(lengths, clip).max() < patch:
+    real = int(np.searchsorted(poses.clip_start, ready.frames))  # clips; their images follow in the same order
+    for clip, (a, b) in enumerate(pairwise(poses.clip_start[: real + 1])):
+        out = tuple(range(clip, len(lengths), real))
+        if real < 2 or np.delete(lengths, out).max() < patch:
             continue
         asked = Posed(training, one_clip(poses, clip, patch), ready.known)
-        made = to_numbers(_match_clip(asked, ready, skip=clip)[0])[: b - a] * unit
+        made = to_numbers(_match_clip(asked, ready, skip=out)[0])[: b - a] * unit
         agree += (made * to_numbers(values[a:b]) * unit).sum((0, 2))
         size += (made**2).sum((0, 2))
     return np.where(size > 0, np.clip(agree / np.maximum(size, 1e-30), 0.0, 1.0), 1.0)

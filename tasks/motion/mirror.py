@@ -6,6 +6,8 @@ nothing and doubles what a method may learn from, wherever skeleton and shape ar
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -38,6 +40,20 @@ def mirrored(training: Training) -> tuple[Poses, np.ndarray] | None:
     moved = poses.translations[:, pairs].astype(np.float64) @ flip
     image = Poses(turns.astype(np.float32), moved.astype(np.float32), poses.clip_start)
     return image, _mirrored_bones(training, flip, at)
+
+
+def with_image(training: Training) -> Training:
+    """The training with a database that holds the image of every clip after all clips; as it is where it has none."""
+    image, known = mirrored(training), training.database
+    if image is None:
+        return training
+    (poses, bones), frames = image, len(known.bones)
+    both = Poses(
+        np.concatenate([known.poses.rotations, poses.rotations]),
+        np.concatenate([known.poses.translations, poses.translations]),
+        np.concatenate([known.poses.clip_start, known.poses.clip_start[1:] + frames]),
+    )
+    return replace(training, database=replace(known, poses=both, bones=np.concatenate([known.bones, bones])))
 
 
 def _across(training: Training, axis: int) -> tuple[float, int, np.ndarray, np.ndarray] | None:

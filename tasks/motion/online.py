@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.sparse import csr_matrix
 
+from tasks.motion.affine import REACH, Space, describe, nearest_moments, space
 from tasks.motion.blending import Sources, window_weights
 from tasks.motion.matching import Prepared, believed, merged
 from tasks.motion.posed import Posed
@@ -63,15 +64,20 @@ class Online:
             WindowSearch(_delayed(known.keys(part, way.dynamics)), k=way.k, patch=way.patch)
             for part in range(len(ready.parts))
         ]
+        self._spaces = [
+            space(search.database, store.heavy) if way.sources else None
+            for search, store in zip(self._searches, ready.parts, strict=True)
+        ]
         skinning = known.training.skinning
         weights = csr_matrix(skinning.weights.astype(np.float64))
         ones = np.ones((len(skinning.rest), 1))
         self._weights, self._rest = weights, np.concatenate([skinning.rest, ones], axis=1)
         self._past: list[tuple[np.ndarray, np.ndarray]] = []
+        self._keys: list[tuple[np.ndarray, np.ndarray]] = []
 
     def restart(self) -> None:
         """Begins a new motion."""
-        self._past = []
+        self._past, self._keys = [], []
         for search in self._searches:
             search.restart()
 
@@ -82,8 +88,12 @@ class Online:
         now = Poses(rotations[None], translations[None], np.array([0, 1]))
         asked = Posed(training, now, ready.known)
         moving = self._moving()
+        self._keys = [*self._keys[-REACH:], (asked.quaternions[0], moving)]
         rows = []
         for part, search in enumerate(self._searches):
+            if ready.way.sources:
+                rows.append(self._moments(part, self._spaces[part]))
+                continue
             turns = asked.quaternions[0, ready.known.key_joints(part)]
             distance, frame = search.push(turns, moving)
             share = window_weights(distance[None], ready.way.temperature)
@@ -91,6 +101,13 @@ class Online:
         bones = asked.decode(believed(ready, merged(asked, ready, rows)), ready.way.represent)[0]
         blended = (self._weights @ bones.reshape(len(bones), 12)).reshape(-1, 3, 4)
         return np.einsum("nij,nj->ni", blended, self._rest).astype(np.float32)
+
+    def _moments(self, part: int, known: Space) -> Sources:
+        """The moments nearest to the latest pose and its past."""
+        joints, heavy = self._ready.known.key_joints(part), self._ready.parts[part].heavy
+        turns, moving = (np.stack(x) for x in zip(*self._keys, strict=True))
+        told = describe(Keys(turns[:, joints], moving, np.array([0, len(turns)])), heavy)[-1:]
+        return nearest_moments(told @ known.basis, known, self._ready.way.sources)
 
     def _moving(self) -> np.ndarray:
         """The root's dynamics some frames ago, (E, 3), as the delayed keys of the database hold them."""

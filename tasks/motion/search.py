@@ -54,11 +54,11 @@ class Matches:
 
 
 def nearest_windows(
-    query: Keys, database: Keys, *, k: int, patch: int, strides: list[int], skip: int | None = None
+    query: Keys, database: Keys, *, k: int, patch: int, strides: list[int], skip: tuple[int, ...] = ()
 ) -> Matches:
     """K nearest windows of ``patch`` frames, ``stride`` apart, none of which crosses a clip (GaussiAnimate eq. 8).
 
-    query: one clip; every stride must satisfy (patch - 1) stride < its frames. skip: a clip of the database that is
+    query: one clip; every stride must satisfy (patch - 1) stride < its frames. skip: clips of the database that are
     left out. Ties go to the earlier window.
     """
     frames = len(query.rotations)
@@ -69,7 +69,7 @@ def nearest_windows(
 
     def block(first: int, last: int) -> None:
         rows = slice(first, min(last + reach, frames))
-        for a, b in (ab for clip, ab in enumerate(pairwise(database.clip_start)) if clip != skip):
+        for a, b in (ab for clip, ab in enumerate(pairwise(database.clip_start)) if clip not in skip):
             for c in range(int(a), int(b), DATABASE_BLOCK):
                 columns = c, min(c + DATABASE_BLOCK + reach, int(b))
                 tile = frame_distances(query.rotations[rows], query.extra[rows], database, *columns)

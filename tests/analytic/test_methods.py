@@ -27,6 +27,8 @@ PAPER = {
     "align": True,
     "dynamics": 0.0,
     "shrink": False,
+    "mirror": False,
+    "sources": 0,
 }
 WAYS = [
     PAPER,
@@ -219,6 +221,8 @@ def test_bad_poses_are_refused(train, method):
         ({"represent": "world"}, "animate.represent"),
         ({"dynamics": -1.0}, "animate.dynamics"),
         ({"shrink": True}, "animate.shrink"),
+        ({"represent": "residual", "shrink": True, "sources": 9}, "animate.shrink"),
+        ({"sources": -1}, "animate.sources"),
     ],
 )
 def test_bad_settings_are_refused(train, change, where):

@@ -42,6 +42,8 @@ PLUS = {
     "align": False,
     "dynamics": 1.0,
     "shrink": True,
+    "mirror": False,
+    "sources": 0,
 }
 
 

@@ -1,0 +1,53 @@
+"""Shares of matched frames that predict the query's pose from theirs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tasks.geometry.measure import vertex_rmse
+from tasks.methods import partmm
+from tasks.motion.affine import Space, nearest_moments
+from tests.analytic import planted
+from tests.analytic.test_methods import PAPER
+
+A, B, UNSEEN = (planted.gesture(n, seed) for n, seed in ((90, 1), (80, 2), (40, 9)))
+RESIDUAL = PAPER | {"represent": "residual", "dynamics": 0.5, "levels": 1}
+
+
+@pytest.fixture(scope="module")
+def train():
+    return planted.training([A, B], affinity=0.0)
+
+
+def on_a_line(at: list[float]) -> Space:
+    return Space(np.array(at)[:, None], np.eye(1), np.ones(1), 1.0)
+
+
+def test_shares_sum_to_one_and_a_source_takes_what_lies_on_it():
+    known = on_a_line([0.0, 1.5, 3.0, 20.0])
+    found = nearest_moments(np.array([[1.5], [2.1], [9.0]]), known, 3)
+    np.testing.assert_allclose(found.share.sum(1), 1.0)
+    assert found.frame[0].tolist() == [0, 1, 2]
+    assert found.share[0].argmax() == 1
+    assert found.share[0, 1] > 0.85
+
+
+def test_ten_copies_of_a_moment_count_as_one():
+    once = nearest_moments(np.array([[0.4]]), on_a_line([0.0, 1.0]), 2)
+    often = nearest_moments(np.array([[0.4]]), on_a_line([0.0] * 10 + [1.0]), 11)
+    assert often.share[0, -1] == pytest.approx(once.share[0, -1], abs=0.04)
+
+
+def test_between_sources_lies_what_between_poses_lies(train):
+    query = planted.poses([UNSEEN])
+    true = planted.truth(train, query)
+    error = {s: vertex_rmse(partmm.animate(train, query, **RESIDUAL | {"sources": s}).points, true) for s in (0, 60)}
+    assert error[60] < 0.95 * error[0]
+
+
+def test_sources_are_training_frames_though_images_are_matched(train):
+    made = partmm.animate(train, planted.poses([A]), **RESIDUAL | {"sources": 30, "mirror": True})
+    assert made.sources.min() >= 0
+    assert made.sources.max() < train.motion.frames
+    assert vertex_rmse(made.points, train.motion.points[:90]) < 1e-2

@@ -26,3 +26,31 @@ def centres(
     p = guess + offset * np.minimum(1.0, reach / np.maximum(length, 1e-12))
     left = np.einsum("fpij,pj->fpi", r, p) + t
     return p, np.sqrt((left * left).sum(axis=2).mean(axis=0))
+
+
+def off_hinges(
+    parents: np.ndarray,
+    joints: np.ndarray,
+    world: np.ndarray,
+    meet: np.ndarray,
+    *,
+    share: float,
+    far: float,
+    gap: float,
+) -> np.ndarray:
+    """Joints moved along the directions that their turns leave open, towards where the skins of both bones meet.
+
+    A hinge is the same wherever on its axis it lies, so that fitting drifts along it. With D_f = R_parent - R_joint,
+    an eigenvector of mean_f D^T D is open when its eigenvalue is under ``share`` of their sum. joints, meet: (J, 3);
+    world: (F, J, 3, 3); far: joints whose skins meet farther away stay, as do those that never turn; gap: RMS distance
+    that a move along one axis may put between both bones' ideas of the joint.
+    """
+    apart = world[:, np.where(parents < 0, 0, parents)] - world
+    turned = np.einsum("fjka,fjkb->jab", apart, apart, optimize=True) / len(world)
+    value, axes = np.linalg.eigh(turned)  # axes in columns
+    total = value.sum(axis=1, keepdims=True)
+    offset = meet - joints
+    near = (np.linalg.norm(offset, axis=1, keepdims=True) < far) & (total > 1e-9)
+    most = gap / np.sqrt(np.maximum(value, 1e-12))
+    along = np.clip(np.einsum("jak,ja->jk", axes, offset), -most, most)
+    return joints + np.einsum("jak,jk->ja", axes, np.where(near & (value < share * total), along, 0.0))

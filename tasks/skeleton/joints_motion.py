@@ -15,11 +15,12 @@ from tasks.geometry.measure import diagonal
 from tasks.geometry.moments import skin_error, skin_moments
 from tasks.geometry.neighbours import adjacency, mesh_edges
 from tasks.geometry.rotations import geodesic, project_so3
-from tasks.skeleton.articulation import centres
+from tasks.skeleton.articulation import centres, off_hinges
 from tasks.skeleton.curve_weights import Interpolation, node_lengths, node_weights, onto_surface, thin, vertex_areas
 from tasks.skeleton.inner_bones import Bones, merge_alike, prune, relative_turn, rigid_pieces
 from tasks.skeleton.refit import posed, refit, spread_weights
 from tasks.skeleton.runs import find_runs
+from tasks.skeleton.symmetry import Mirror, find_mirror
 from tasks.skeleton.tree import joint_names, kinematic_tree, link_components
 from tasks.values import Canonical, Curve, Motion, Skeleton, Skinning, Surface
 
@@ -33,6 +34,8 @@ _INFLUENCES = 4  # bones a point follows while they are pruned: more let ghosts 
 _AFTER = 6  # and once they are chosen
 _CLEARLY = 0.9  # of the squared error
 _LIMBS, _TRUNK = 3, 0.3  # the root has at least so many bones round it, and this part of the largest such bone's skin
+_FAR = 0.15  # of the diagonal: farther from its joint, the skin that two bones share says nothing of it
+_GAP = 0.003  # of the diagonal: what taking a joint along its hinge to there may cost
 _LEAST = 3  # points that a piece needs to turn as a whole
 _WARM_UP = 3  # rounds of SSDR before pruning
 
@@ -40,12 +43,13 @@ _WARM_UP = 3  # rounds of SSDR before pruning
 @dataclass(frozen=True)
 class Body:
     """What joints are looked for on. surface, curve: of the canonical shape; carry: from the bones' points to the
-    surface; size: the shape's diagonal."""
+    surface; size: the shape's diagonal; mirror: its plane of symmetry, where it has one."""
 
     surface: Surface
     curve: Curve
     carry: Interpolation
     size: float
+    mirror: Mirror | None
 
     def on_curve(self, weights: np.ndarray) -> np.ndarray:
         """Weights of the bones' points (N, B) on the curve's nodes (M, B)."""
@@ -74,13 +78,15 @@ class Articulation:
 @dataclass(frozen=True)
 class Watched:
     """What a tree is refitted to. chosen: (K,) numbers of points; more: (F,) numbers of frames; rest: (K, 3); paths:
-    (F, K, 3); few_paths: (f, K, 3), in the frames that the bones' transforms are of."""
+    (F, K, 3); few_paths: (f, K, 3), in the frames that the bones' transforms are of; carry: from the points to the
+    surface."""
 
     chosen: np.ndarray
     more: np.ndarray
     rest: np.ndarray
     paths: np.ndarray
     few_paths: np.ndarray
+    carry: Interpolation
 
 
 @dataclass(frozen=True)
@@ -107,6 +113,8 @@ def joints_by_motion(
     angle: float,
     shortest: float,
     reach: float,
+    hinge: float,
+    symmetric: bool,
     rounds: int,
     refits: int,
     influences: int,
@@ -121,19 +129,27 @@ def joints_by_motion(
     follows the motion clearly better; knee: times the least error that fewer
     bones may cost; missed: degrees by which a bone's points must miss without it to be safe; angle: degrees below
     which two bones that touch are one; shortest: run of curve below which a bone is dropped (curve topology); reach:
-    how far a joint may lie from where its bones meet on the curve; rounds: rounds of SSDR once the bones are chosen;
+    how far a joint may lie from where its bones meet on the curve; hinge: along
+    an axis with less than this share of the squared turn a joint goes to where its bones' skins meet; symmetric: left
+    and right of a shape that is its own mirror image get mirrored joints; rounds: of SSDR once the bones are chosen;
     refits: rounds of refitting; influences: most joints a point may follow. Lengths are shares of the bounding-box
     diagonal. Raises InputError for settings out of range.
     """
-    _check_settings(max_joints, influences, knee, angle, missed)
+    _check_settings(max_joints, influences, knee, angle, missed, hinge)
     size = diagonal(canonical.points)
     chosen = thin(canonical, surface, curve, _POINTS)
-    body = Body(surface, curve, onto_surface(_sampled(canonical, chosen), surface), size)
+    body = Body(
+        surface,
+        curve,
+        onto_surface(_sampled(canonical, chosen), surface),
+        size,
+        find_mirror(surface) if symmetric else None,
+    )
     frames = _spread(train.frames, _FRAMES)
     bones = _bones(train, canonical, skinning, frames, chosen)
     bones = few_bones(bones, body, at_most=max_joints, knee=knee, missed=missed, angle=angle, rounds=rounds)
     watched = _watch(train, canonical, body, frames)
-    refitting = {"rounds": refits, "influences": influences, "reach": reach * size}
+    refitting = {"rounds": refits, "influences": influences, "reach": reach * size, "hinge": hinge}
     fits = []
     if topology != "curve":
         tree = better_posed(by_motion(bones, body, reach), by_motion(bones, body, reach, relative=True), body)
@@ -248,19 +264,44 @@ def _watch(train: Motion, canonical: Canonical, body: Body, frames: np.ndarray) 
     chosen = thin(canonical, body.surface, body.curve, _REFIT_POINTS)
     more = _spread(train.frames, _REFIT_FRAMES)
     rest = canonical.points[chosen].astype(np.float64)
-    return Watched(chosen, more, rest, train.points[more][:, chosen], train.points[frames][:, chosen])
+    carry = onto_surface(_sampled(canonical, chosen), body.surface)
+    return Watched(chosen, more, rest, train.points[more][:, chosen], train.points[frames][:, chosen], carry)
 
 
 def _fit_tree(
-    found: Articulation, body: Body, watched: Watched, *, rounds: int, influences: int, reach: float, hold: float
+    found: Articulation,
+    body: Body,
+    watched: Watched,
+    *,
+    rounds: int,
+    influences: int,
+    reach: float,
+    hinge: float,
+    hold: float,
 ) -> Fit:
     """The tree over the bones, its joints and weights refitted to the motion of the watched points."""
     order, parents, joints = _assemble(found, body)
     transforms = found.bones.transforms[:, order]
     nothing = np.zeros((len(watched.rest), len(joints)))
+
+    def settle(joints: np.ndarray, weights: np.ndarray, world: np.ndarray) -> np.ndarray:
+        meet = _meet(parents, joints, watched.carry.carry(weights), body.surface)
+        far, gap = _FAR * body.size, _GAP * body.size
+        joints = off_hinges(parents, joints, world, meet, share=hinge, far=far, gap=gap)
+        return joints if body.mirror is None else body.mirror.even(joints)
+
     start = Bones(watched.rest, watched.few_paths, nothing, transforms, influences).refit(transforms, nothing)
-    how = {"rounds": rounds, "influences": influences, "reach": reach, "hold": hold}
+    how = {"rounds": rounds, "influences": influences, "reach": reach, "hold": hold, "settle": settle}
     return Fit(parents, *refit(watched.paths, watched.rest, parents, joints, start.weights, **how))
+
+
+def _meet(parents: np.ndarray, joints: np.ndarray, weights: np.ndarray, surface: Surface) -> np.ndarray:
+    """(J, 3) middle of the skin that each joint shares with its parent; the joint itself where they share none.
+    weights: (V, J) of the surface."""
+    share = (weights * weights[:, np.maximum(parents, 0)]) ** 2 * vertex_areas(surface)[:, None]
+    share[:, parents < 0] = 0.0
+    total = share.sum(axis=0)[:, None]
+    return np.where(total > 0.0, share.T @ surface.vertices / np.where(total > 0.0, total, 1.0), joints)
 
 
 def _chosen(by_motion: Fit, by_curve: Fit, watched: Watched) -> Fit:
@@ -359,13 +400,14 @@ def _middles(share: np.ndarray, curve: Curve) -> np.ndarray:
     return (share.T @ curve.nodes) / share.sum(axis=0)[:, None]
 
 
-def _check_settings(max_joints: int, influences: int, knee: float, angle: float, missed: float) -> None:
+def _check_settings(max_joints: int, influences: int, knee: float, angle: float, missed: float, hinge: float) -> None:
     for name, value, low, high in (
         ("max_joints", max_joints, 1, 500),
         ("influences", influences, 1, 16),
         ("knee", knee, 1.0, 100.0),
         ("angle", angle, 0.0, 90.0),
         ("missed", missed, 0.0, 90.0),
+        ("hinge", hinge, 0.0, 0.5),
     ):
         if not low <= value <= high:
             raise InputError(f"skeleton.motion.{name}", expected=f"{low} to {high}", found=str(value))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -11,6 +13,7 @@ from tasks.skeleton.inverse_kinematics import solve_poses, transforms_of, warm_s
 
 _STEPS = 2  # Gauss-Newton steps a round: the next round goes on from there
 _FIRST_STEPS = 5
+_SETTLED = 3
 _DAMPING = 1e-4
 _STIFFNESS = 0.01
 
@@ -26,11 +29,13 @@ def refit(
     influences: int,
     reach: float,
     hold: float,
+    settle: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Alternates poses, weights and joint positions, each of which lowers the skinning error.
 
     points: (F, N, 3); rest: (N, 3); joints: (J, 3); weights: (N, J); reach: how far a joint may move from where it
-    was found (nought: not at all); hold: pull to there, against the squared turn about the joint -> joints (J, 3)
+    was found (nought: not at all); hold: pull to there, against the squared turn about the joint; settle: from joints,
+    weights and world rotations (F, J, 3, 3) to the joints that the last ``_SETTLED`` rounds keep -> joints (J, 3)
     float64 and weights (N, J) float32. Joints without points keep none.
     """
     origin = rest.mean(axis=0, dtype=np.float64)
@@ -42,6 +47,8 @@ def refit(
         moments = skin_moments(rest, weights, points)
         if world is None:
             world, root = warm_start(parents, joints, moments, _STIFFNESS)
+        if settle is not None and r == max(rounds - _SETTLED, 1):
+            joints, reach = settle(joints + origin, weights, world) - origin, 0.0
         steps = _STEPS if r else _FIRST_STEPS
         world, root = solve_poses(parents, joints, moments, world, root, steps=steps, damping=_DAMPING)
         if reach > 0:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -11,16 +12,17 @@ from threadpoolctl import threadpool_limits
 from tasks.errors import InputError
 from tasks.geometry import kinematics, rigid
 from tasks.geometry.measure import vertex_rmse
-from tasks.geometry.rotations import from_rotation_vector
+from tasks.geometry.rotations import from_rotation_vector, geodesic
 from tasks.geometry.skinning import skin
 from tasks.geometry.sparse_weights import fit_weights
-from tasks.skeleton.articulation import centres
+from tasks.skeleton.articulation import centres, off_hinges
 from tasks.skeleton.inner_bones import Bones, prune
 from tasks.skeleton.joints_gradient import joints_by_gradient
 from tasks.skeleton.joints_motion import Articulation, _root, joints_by_motion, keep_inside
 from tasks.skeleton.poses import fit_poses
+from tasks.skeleton.symmetry import find_mirror
 from tasks.values import Curve, Skinning
-from tests.analytic.jointed_shapes import Bending, ball_joint
+from tests.analytic.jointed_shapes import RADIUS, Bending, ball_joint
 from tests.shipped import shipped
 
 SETTINGS = shipped("skeleton.motion")
@@ -61,6 +63,84 @@ def test_a_hinge_is_found_though_it_is_free_along_its_axis():
     skeleton = find(shape)
     assert len(skeleton.joints) == 2
     np.testing.assert_allclose(skeleton.joints[1], [1.0, 0.0, 0.0], atol=0.02)
+
+
+def test_a_hinge_lies_where_its_skins_meet_and_a_ball_joint_where_it_turns():
+    parents, joints = np.array([-1, 0, 0, 0]), np.array([[0.0, 0, 0], [1, 0, 0.4], [1, 0, 0], [1, 0, 0]])
+    meet = np.array([[9.0, 9, 9], [1.1, 0.1, 0.0], [1.1, 0.1, 0.1], [7, 7, 7]])
+    rng = np.random.default_rng(0)
+    turns = np.zeros((50, 4, 3))
+    turns[:, 1, 2] = rng.uniform(-1, 1, 50)  # free along z
+    turns[:, 2] = rng.uniform(-1, 1, (50, 3))
+    turns[:, 3, 2] = rng.uniform(-1, 1, 50)
+    found = off_hinges(parents, joints, from_rotation_vector(turns), meet, share=0.1, far=0.5, gap=0.01)
+    np.testing.assert_allclose(found[1], [1.0, 0.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(found[[0, 2, 3]], joints[[0, 2, 3]])  # the last one's skins meet too far away
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_left_and_right_of_a_symmetric_shape_have_as_many_joints_at_mirrored_places(seed):
+    rng = np.random.default_rng(seed)
+    turns = rng.uniform(-0.5, 0.5, (50, 3, 3))
+    shape = Bending(4.0, [0.0, 1.0, 3.0], turns, rng.normal(size=(50, 3)), 0.1)
+    skeleton = find(shape)
+    x = np.sort(skeleton.joints[1:, 0] - 2.0)
+    assert len(x) == 2
+    np.testing.assert_allclose(x, -x[::-1], atol=1e-3)
+    np.testing.assert_allclose(x, [-1.0, 1.0], atol=0.03)
+    assert np.abs(skeleton.joints[1:, 1:]).max() < RADIUS
+
+
+def test_a_mirror_is_found_and_only_where_there_is_one():
+    shape = ball_joint()
+    mirror = find_mirror(shape.surface)
+    points = shape.surface.vertices.astype(float)
+    np.testing.assert_allclose(mirror.image(mirror.image(points)), points, atol=1e-9)
+    some = np.array([[0.5, 0.0, 0.0], [0.52, 0.01, 0.01], [1.5, 0.0, 0.02]])
+    assert (mirror.partners(some) >= -1).all()
+    evened = mirror.even(some)
+    for a, b in enumerate(mirror.partners(some)):
+        if b >= 0:
+            np.testing.assert_allclose(evened[a], mirror.image(evened)[b], atol=1e-9)
+    bent = shape.motion.points[0].astype(np.float32)
+    rng = np.random.default_rng(0)
+    uneven = bent * rng.uniform(0.7, 1.3, (len(bent), 1)).astype(np.float32)
+    assert find_mirror(replace(shape.surface, vertices=uneven)) is None
+
+
+def test_the_tree_is_stable_between_neighbouring_prefixes():
+    """A skeleton from more of the same motion has the same tree, its joints where they were."""
+    rng = np.random.default_rng(3)
+    turns = np.cumsum(rng.normal(0.0, 0.12, (60, 3, 3)), axis=0).clip(-0.7, 0.7)
+    shape = Bending(3.0, [0.0, 1.0, 2.0], turns, rng.normal(size=(60, 3)), 0.1)
+    found = []
+    for frames in (36, 45, 60):
+        first = replace(shape.motion, points=shape.motion.points[:frames], clip_start=np.array([0, frames]))
+        seen = replace(shape.skinning, transforms=shape.skinning.transforms[:frames])
+        inputs = (first, shape.canonical, seen, shape.surface, shape.curve)
+        found.append(joints_by_motion(*inputs, **SETTINGS))
+    for skeleton in found:
+        assert len(skeleton.parents) == 3
+        np.testing.assert_allclose(np.sort(skeleton.joints[1:, 0]), np.sort(found[-1].joints[1:, 0]), atol=0.02)
+
+
+def test_poses_of_a_found_skeleton_carry_the_root_and_never_flip():
+    """The whole turns right round while it walks far off; what the joints turn between two frames stays small."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 60)
+    turns = np.zeros((60, 3, 3))
+    turns[:, 0, 1] = angle
+    turns[:, 1:, 2] = 0.5 * np.sin(np.array([2.0, 3.0]) * angle[:, None])
+    turns[:, 1:, 1] = 0.4 * np.cos(np.array([3.0, 2.0]) * angle[:, None])
+    walk = np.stack([10.0 * np.cos(angle), np.zeros(60), 10.0 * np.sin(angle)], axis=1)
+    shape = Bending(3.0, [0.0, 1.0, 2.0], turns, walk, 0.1)
+    skeleton = find(shape)
+    poses = fit_poses(shape.motion, shape.canonical, skeleton, **POSES)
+    assert skeleton.parents.tolist().count(-1) == 1
+    step = np.degrees(geodesic(poses.rotations[1:], poses.rotations[:-1]))
+    assert step.max() < 20.0
+    transforms = kinematics.forward(skeleton.parents, skeleton.joints, poses.rotations, poses.translations)
+    centre = skin(shape.canonical.points, skeleton.weights, transforms).mean(axis=1)
+    np.testing.assert_allclose(centre, shape.motion.points.mean(axis=1), atol=0.01)
 
 
 def test_a_chain_of_three_is_a_chain():

@@ -14,7 +14,6 @@ from tasks.errors import InputError
 from tasks.reconstruction import checkpoint, cuts, density
 from tasks.reconstruction.adam import Adam
 from tasks.reconstruction.curriculum import Schedule, Window
-from tasks.reconstruction.drift import drift
 from tasks.reconstruction.hull import Start, ball_start, hull_start
 from tasks.reconstruction.losses import photometric
 from tasks.reconstruction.mlp import Mlp
@@ -218,15 +217,10 @@ class Fitting:
         solid = torch.sigmoid(self.params["opacities"].detach()) > density.TRANSPARENT
         points = self.params["means"].detach()[solid].cpu().numpy()
         if recipe.deformation == "nodes":
-            self.deformation = Nodes.placed(self._spline(), points, recipe.carriers, self._drift())
+            self.deformation = Nodes.placed(self._spline(), points, recipe.carriers)
         else:
             self.deformation = Mlp.placed(self.capture.times, points, recipe.carriers, recipe.seed, **self._network())
         self._bind()
-
-    def _drift(self) -> np.ndarray:
-        """What the splines can say of it, so that they can also take it back."""
-        where = self._spline().smoothed(drift(self.capture))
-        return ((where - where[self.start.frame]) / self.unit).astype(np.float32)
 
     def _bind(self) -> None:
         if self.deformation is not None:
@@ -249,7 +243,7 @@ class Fitting:
                 self.frames = frames
                 for clip, (first, last) in enumerate(frames):
                     if last >= first:
-                        self.deformation.go_on_outwards(first, last, clip)
+                        self.deformation.copy_outwards(first, last, clip)
         if self.iteration % 2 and self.frames:
             edge = self.window.edge(self.frames)
             if len(edge):
@@ -337,7 +331,7 @@ class Fitting:
         recipe = self.recipe
         if recipe.deformation == "nodes":
             centres, level = tensors["centres"].numpy(), tensors["level"].numpy()
-            self.deformation = Nodes(self._spline(), centres, level, params["table"].cpu().numpy(), self._drift())
+            self.deformation = Nodes(self._spline(), centres, level, params["table"].cpu().numpy())
             self.deformation.index, self.deformation.weights = tensors["index"], tensors["weights"]
         else:
             self.deformation = Mlp(self.capture.times, tensors["rest"].numpy(), **self._network())

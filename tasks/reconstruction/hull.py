@@ -14,8 +14,6 @@ INSIDE = 128  # alpha from which a pixel belongs to the thing
 COARSE = 40  # cells along a side of the cube that is searched for the thing
 TRIED = 12  # reference times that are compared
 LEAST_CELLS = 30  # a hull of fewer cells is no start
-TIE = 0.01  # recall within which hulls are as good as each other
-ENOUGH = 4  # images of one frame that make a hull by themselves
 
 
 @dataclass(frozen=True)
@@ -34,16 +32,13 @@ def hull_start(capture: Capture, *, frame: int | None, views: int, agree: float,
 
     A point is inside when at least the share ``agree`` of the masks hold it; outside an image counts as outside its
     mask. frame: the reference, or None for the one of twelve whose hull covers its own masks best: the thing hardly
-    moves there; of equals, the one nearest to the middle of its clip, from where the way to both ends is short.
-    cells: along the longest side of the hull's box. Raises InputError where no masks agree.
+    moves there. cells: along the longest side of the hull's box. Raises InputError where no masks agree.
     """
     centre, radius = whereabouts(capture)
     frames = np.unique(capture.frame)
     tried = [frame] if frame is not None else frames[np.linspace(0, len(frames) - 1, TRIED).astype(int)].tolist()
     found = [(*_cells(capture, f, views, agree, centre - radius, 2 * radius / COARSE, (COARSE,) * 3), f) for f in tried]
-    best = max(recall for _, recall, _ in found)
-    as_good = [c for c in found if c[1] >= best - TIE]
-    inside, recall, frame = min(as_good, key=lambda c: _off_middle(capture, c[2]))
+    inside, recall, frame = max(found, key=lambda c: c[1])
     if np.count_nonzero(inside) < LEAST_CELLS:
         raise InputError(
             f"{capture.name}: masks",
@@ -98,19 +93,8 @@ def whereabouts(capture: Capture) -> tuple[np.ndarray, float]:
     return centre, float(np.quantile(half * distance, 0.95)) * 1.1
 
 
-def _off_middle(capture: Capture, frame: int) -> float:
-    """How far a frame lies from the middle of its clip, 0 to 0.5."""
-    clip = int(np.searchsorted(capture.clip_start, frame, side="right")) - 1
-    low, high = int(capture.clip_start[clip]), int(capture.clip_start[clip + 1])
-    return abs((frame + 0.5 - low) / (high - low) - 0.5)
-
-
 def nearest_views(capture: Capture, frame: int, count: int) -> np.ndarray:
-    """The ``count`` images nearest in time to a frame, in its own clip where it has enough; all of the frame's own,
-    and none but those where they are enough for a hull: in no other frame does the thing stand just like this."""
-    own_images = np.flatnonzero(capture.frame == frame)
-    if len(own_images) >= ENOUGH:
-        return own_images
+    """The ``count`` images nearest in time to a frame, in its own clip where it has enough; all of the frame's own."""
     clip = np.searchsorted(capture.clip_start, capture.frame, side="right")
     own = int(np.searchsorted(capture.clip_start, frame, side="right"))
     far = np.abs(capture.times[capture.frame] - capture.times[frame]) + 10.0 * (clip != own)

@@ -77,7 +77,7 @@ class Mlp:
     def roughness(self) -> torch.Tensor | None:
         """The bands of time bound how fast it may change: nothing to ask."""
 
-    def go_on_outwards(self, first: int, last: int, clip: int) -> None:
+    def copy_outwards(self, first: int, last: int, clip: int) -> None:
         """A network has no knots: frames not seen yet are what it makes of them."""
 
 

@@ -19,21 +19,16 @@ from tasks.reconstruction.splines import Spline
 
 BOUND = 4  # nodes that a Gaussian follows
 COARSER = 4  # every level has a quarter of the nodes of the one below
-GO_ON = 0.7  # share of its pace that motion keeps with every knot beyond those that have been learned
 FEWEST = 8  # a level of fewer nodes is left to the one node for all
 
 
 class Nodes:
     """centres: (S, 3) nodes of all levels, the finest first; level: (S,) int64; table: (knots, S, 7) float32, what is
-    added to the unit quaternion (w x y z) and the shift, the parameter; drift: (F, 3) float32, how far the whole has
-    gone in each frame, which is known beforehand."""
+    added to the unit quaternion (w x y z) and the shift, the parameter."""
 
-    def __init__(
-        self, spline: Spline, centres: np.ndarray, level: np.ndarray, table: np.ndarray, drift: np.ndarray
-    ) -> None:
+    def __init__(self, spline: Spline, centres: np.ndarray, level: np.ndarray, table: np.ndarray) -> None:
         self.spline, self.centres, self.level = spline, centres, level
         self.table = torch.from_numpy(table).requires_grad_()
-        self.drift = torch.from_numpy(drift)
         fine = centres[level == 0]
         self.count = len(fine)
         self.rest = torch.from_numpy(fine)
@@ -48,8 +43,8 @@ class Nodes:
         self.index = self.weights = None
 
     @classmethod
-    def placed(cls, spline: Spline, points: np.ndarray, count: int, drift: np.ndarray) -> Nodes:
-        """Nodes spread over the points, at rest but for the drift."""
+    def placed(cls, spline: Spline, points: np.ndarray, count: int) -> Nodes:
+        """Nodes spread over the points, at rest."""
         chosen, level = [], []
         while count >= FEWEST or not chosen:
             spread = points[farthest(points, min(count, len(points)))]
@@ -59,7 +54,7 @@ class Nodes:
         chosen.append(points.mean(0, keepdims=True))
         centres = np.concatenate(chosen).astype(np.float32)
         level = np.array([*level, len(chosen) - 1])
-        return cls(spline, centres, level, np.zeros((spline.knots, len(centres), 7), np.float32), drift)
+        return cls(spline, centres, level, np.zeros((spline.knots, len(centres), 7), np.float32))
 
     def bind(self, means: np.ndarray) -> None:
         """Chooses the nodes that each Gaussian follows, and how much. means: (N, 3) at rest."""
@@ -81,7 +76,7 @@ class Nodes:
         for follow, level in zip(self._follow, coarse, strict=True):
             outer = (follow @ level.reshape(len(level), 12)).view(-1, 3, 4)
             fine = outer @ torch.cat([fine, self._last], dim=1)
-        return torch.cat([fine[..., :3], (fine[..., 3] + self.drift[frame])[..., None]], dim=2)
+        return fine
 
     def at(self, frame: int, means: torch.Tensor) -> Deformed:
         """Where the Gaussians are in a frame. means: (N, 3) at rest."""
@@ -95,20 +90,13 @@ class Nodes:
         bend = self.table[self._inner] - 2 * self.table[self._inner + 1] + self.table[self._inner + 2]
         return bend.square().sum() / len(self._inner)
 
-    def go_on_outwards(self, first: int, last: int, clip: int) -> None:
-        """Frames outside first..last of a clip go on from the pose at that end, slower and slower: what has not been
-        seen yet starts there."""
+    def copy_outwards(self, first: int, last: int, clip: int) -> None:
+        """Frames outside first..last of a clip take the pose at that end: what has not been seen yet starts there."""
         knots = slice(int(self.spline.clip_knots[clip]), int(self.spline.clip_knots[clip + 1]))
         low, high = int(self.spline.first[first]) + 1, int(self.spline.first[last]) + 2
         with torch.no_grad():
             self.table[knots.start : low] = self.table[low].clone()
             self.table[high + 1 : knots.stop] = self.table[high].clone()
-            if high - low < 4:  # too few knots have been learned to know a pace
-                return
-            for edge, back, count in ((low, 1, low - knots.start), (high, -1, knots.stop - 1 - high)):
-                pace = (self.table[edge] - self.table[edge + 2 * back]) / 2
-                for k in range(1, count + 1):
-                    self.table[edge - k * back] += float(GO_ON * (1 - GO_ON**k) / (1 - GO_ON)) * pace
 
 
 def farthest(points: np.ndarray, count: int) -> np.ndarray:

@@ -23,12 +23,6 @@ class Spline:
         """Number of knots of all clips."""
         return int(self.clip_knots[-1])
 
-    def smoothed(self, path: np.ndarray) -> np.ndarray:
-        """The spline nearest to a path in all frames. (F, 3) -> (F, 3) float64."""
-        basis = np.zeros((len(self.first), self.knots))
-        basis[np.arange(len(basis))[:, None], self.first[:, None] + np.arange(4)] = self.weights
-        return basis @ np.linalg.lstsq(basis, path, rcond=None)[0]
-
 
 def spline(clip_start: np.ndarray, spacing: float) -> Spline:
     """Knots at most ``spacing`` frames apart for every clip. clip_start: (C+1,) rising frame numbers from 0.

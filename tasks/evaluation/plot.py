@@ -90,10 +90,12 @@ def lines(
         parts.append(f'<line class="mark" x1="{at:.1f}" x2="{at:.1f}" y1="{TOP}" y2="{HEIGHT - BOTTOM}"/>')
         parts.append(f'<text x="{at + shift:.1f}" y="{TOP + 12}" text-anchor="{anchor}">{escape(mark[1])}</text>')
     for i, one in enumerate(series):
-        parts += _line(one, across, up, COLOURS[i % len(COLOURS)])
+        parts += _line(one, across, up, *_look(i))
+    width = WIDTH
     if len(series) > 1:
         parts += _names(series)
-    return _svg(parts, HEIGHT, f"{y} against {x}")
+        width += 44 + int(7.2 * max(len(one.name) for one in series))
+    return _svg(parts, HEIGHT, f"{y} against {x}", width)
 
 
 def dots(rows: list[str], series: list[Series], *, x: str, zero: str = "") -> str:
@@ -170,7 +172,12 @@ def _frame(across: _Axis, up: _Axis, x: str, y: str) -> list[str]:
     return parts
 
 
-def _line(one: Series, across: _Axis, up: _Axis, colour: str) -> list[str]:
+def _look(index: int) -> tuple[str, str]:
+    """Colour and dashes: when the colours are used up, dashed lines begin with them again."""
+    return COLOURS[index % len(COLOURS)], ' stroke-dasharray="6 3"' if index >= len(COLOURS) else ""
+
+
+def _line(one: Series, across: _Axis, up: _Axis, colour: str, dashes: str) -> list[str]:
     order = np.argsort(one.x, kind="stable")
     xs, ys = np.asarray(one.x, float)[order], np.asarray(one.y, float)[order]
     dots = [(across(a), up(b)) for a, b in zip(xs, ys, strict=True)]
@@ -180,7 +187,7 @@ def _line(one: Series, across: _Axis, up: _Axis, colour: str) -> list[str]:
         above = [(across(a), up(b)) for a, b in zip(xs, ys + half, strict=True)]
         below = [(across(a), up(b)) for a, b in zip(xs, ys - half, strict=True)]
         parts.append(f'<polygon points="{_points([*above, *below[::-1]])}" fill="{colour}" fill-opacity=".18"/>')
-    parts.append(f'<polyline points="{_points(dots)}" fill="none" stroke="{colour}" stroke-width="2"/>')
+    parts.append(f'<polyline points="{_points(dots)}" fill="none" stroke="{colour}" stroke-width="2"{dashes}/>')
     if len(dots) <= 60:
         parts += [f'<circle cx="{a:.1f}" cy="{b:.1f}" r="3" fill="{colour}"/>' for a, b in dots]
     return parts
@@ -191,13 +198,15 @@ def _points(dots: list[tuple[float, float]]) -> str:
 
 
 def _names(series: list[Series]) -> list[str]:
-    """The legend: upper right, one line a series."""
-    parts = []
-    for i, one in enumerate(series):
-        y, colour = TOP + 6 + 18 * i, COLOURS[i % len(COLOURS)]
-        parts.append(f'<text x="{WIDTH - RIGHT - 30}" y="{y + 4}" text-anchor="end">{escape(one.name)}</text>')
-        parts.append(f'<line x1="{WIDTH - RIGHT - 24}" x2="{WIDTH - RIGHT}" y1="{y}" y2="{y}" stroke="{colour}"')
-        parts[-1] += ' stroke-width="3"/>'
+    """The legend: beside the chart, one line a series, the highest at its right end first."""
+    parts, left = [], WIDTH - RIGHT + 14
+    order = sorted(range(len(series)), key=lambda i: -float(series[i].y[np.argmax(series[i].x)]))
+    for row, i in enumerate(order):
+        y, (colour, dashes) = TOP + 6 + 18 * row, _look(i)
+        parts.append(
+            f'<line x1="{left}" x2="{left + 24}" y1="{y}" y2="{y}" stroke="{colour}" stroke-width="3"{dashes}/>'
+        )
+        parts.append(f'<text x="{left + 30}" y="{y + 4}">{escape(series[i].name)}</text>')
     return parts
 
 
@@ -230,8 +239,8 @@ def _names_above(names: list[str], left: float) -> list[str]:
     return parts
 
 
-def _svg(parts: list[str], height: float, label: str) -> str:
-    size = f'viewBox="0 0 {WIDTH} {height}" width="{WIDTH}"'
+def _svg(parts: list[str], height: float, label: str, width: float = WIDTH) -> str:
+    size = f'viewBox="0 0 {width} {height}" width="{width}"'
     head = f'<svg xmlns="http://www.w3.org/2000/svg" class="chart" {size} role="img"'
     body = "\n".join(parts)
     return f'{head} aria-label="{escape(label, quote=True)}"><style>{_STYLE}</style>{body}</svg>\n'

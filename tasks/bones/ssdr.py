@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from tasks.bones import transforms, weights
 from tasks.bones.clustering import split
 from tasks.bones.graph import Graph, moving_together
+from tasks.bones.losses import losses
 from tasks.bones.trajectories import Trajectories, compress
 from tasks.errors import InputError
 from tasks.geometry.measure import vertex_rmse
@@ -225,7 +226,7 @@ def _remove(part: Trajectories, bones: _Bones, wanted: int) -> None:
     """Removes some of the bones that are missed least, in place; never two that share many points."""
     count = len(bones.offsets)
     room = min(count - wanted, max(1, int(_REMOVED * count)))
-    loss = weights.losses(part, weights.forms(part, bones.offsets), bones.index, bones.value)
+    loss = losses(part, weights.forms(part, bones.offsets), bones.index, bones.value)
     k, _ = transforms.sums(part, bones.index, bones.value, count)
     size = np.sqrt(np.einsum("bb->b", k[:, :, 3, 3])) + 1e-300
     overlap = k[:, :, 3, 3] / (size[:, None] * size)

@@ -17,12 +17,13 @@ from numba import njit
 
 from tasks.bones.graph import Graph, alone
 from tasks.bones.products import FAST, product
+from tasks.bones.simplex import solve
+from tasks.bones.simplex import value as value_of
 from tasks.bones.trajectories import Trajectories
 from tasks.geometry.parallel import for_chunks
 
-_POINTS = 512  # points a thread takes at a time
-_TILE = 8  # points whose correlations with all bones are computed together
-_RIDGE = 1e-9  # relative to the mean diagonal: keeps the solve of two bones that move alike from dividing by zero
+POINTS = 512  # points a thread takes at a time
+TILE = 8  # points whose correlations with all bones are computed together
 _PAIRS = [(i, j) for i in range(4) for j in range(i, 4)]  # the upper triangle, row by row
 _GAIN = 1e-4  # relative gain below which an exchange is not worth its solve
 
@@ -75,7 +76,7 @@ def nearest_bone(paths: Trajectories, offsets: np.ndarray) -> tuple[np.ndarray, 
     def work(start: int, stop: int) -> None:
         _nearest_bone(paths.rest, paths.path, paths.lengths, paths.frames, linear, own, label, error, start, stop)
 
-    for_chunks(work, len(label), _POINTS)
+    for_chunks(work, len(label), POINTS)
     return label, error
 
 
@@ -123,27 +124,12 @@ def exchange(
             stop,
         )
 
-    for_chunks(work, len(index), _POINTS)
+    for_chunks(work, len(index), POINTS)
     return error
 
 
-def losses(paths: Trajectories, bones: Forms, index: np.ndarray, value: np.ndarray) -> np.ndarray:
-    """How much the squared error would rise without each bone, if every point could take one other in its place.
-
-    index, value: see :func:`exchange` -> (B,) sum over points of means over frames.
-    """
-    loss = np.empty(index.shape)
-
-    def work(start: int, stop: int) -> None:
-        length, frames = paths.lengths, paths.frames
-        _losses(paths.rest, paths.path, length, frames, bones.linear, bones.square, index, value, loss, start, stop)
-
-    for_chunks(work, len(index), _POINTS)
-    return np.bincount(np.maximum(index, 0).ravel(), loss.ravel(), minlength=len(bones.square))
-
-
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _correlate(rest, path, linear, low, high, raw, correlation):
+def correlate(rest, path, linear, low, high, raw, correlation):
     """correlation[n - low, b] = <D_b h_n, u_n>, mean over frames, for the points low..high and all bones."""
     columns = linear.shape[1]
     count = columns // 4
@@ -181,7 +167,7 @@ def _correlate_few(h, path, rows, bones, correlation):
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _products_of(h, out):
+def products_of(h, out):
     """The ten different entries of h h^T."""
     k = 0
     for i in range(4):
@@ -193,12 +179,12 @@ def _products_of(h, out):
 @njit(cache=True, nogil=True, fastmath=FAST)
 def _nearest_bone(rest, path, length, frames, linear, own, label, error, start, stop):
     count = own.shape[1]
-    raw, correlation, hh = np.empty((_TILE, 4 * count)), np.empty((_TILE, count)), np.empty(10)
-    for low in range(start, stop, _TILE):
-        high = min(low + _TILE, stop)
-        _correlate(rest, path, linear, low, high, raw, correlation)
+    raw, correlation, hh = np.empty((TILE, 4 * count)), np.empty((TILE, count)), np.empty(10)
+    for low in range(start, stop, TILE):
+        high = min(low + TILE, stop)
+        correlate(rest, path, linear, low, high, raw, correlation)
         for n in range(low, high):
-            _products_of(rest[n], hh)
+            products_of(rest[n], hh)
             best, least = 0, np.inf
             for b in range(count):
                 total = length[n] / frames - 2.0 * correlation[n - low, b]
@@ -231,7 +217,7 @@ def _exchange(
     stop,
 ):
     count, slots = len(square), index.shape[1]
-    raw, correlation = np.empty((_TILE, 4 * count)), np.empty((_TILE, count))
+    raw, correlation = np.empty((TILE, 4 * count)), np.empty((TILE, count))
     hh = np.empty(10)
     diagonal, reach = np.empty((10, count)), np.empty(count)
     for b in range(count):
@@ -239,15 +225,15 @@ def _exchange(
             diagonal[k, b] = square[b, k, b]
     bones, w = np.empty(slots + 1, np.int64), np.empty(slots + 1)
     q = np.empty((slots + 1, slots + 1))
-    for low in range(start, stop, _TILE):
-        high = min(low + _TILE, stop)
+    for low in range(start, stop, TILE):
+        high = min(low + TILE, stop)
         if rounds > 0:
-            _correlate(rest, path, linear, low, high, raw, correlation)
+            correlate(rest, path, linear, low, high, raw, correlation)
         for n in range(low, high):
             c, e = correlation[n - low], length[n] / frames
             if rounds == 0:
                 _correlate_few(rest[n], path[n], rows, index[n], c)
-            _products_of(rest[n], hh)
+            products_of(rest[n], hh)
             if smoothness > 0.0:
                 _pull(n, graph, last, smoothness, c)
             if locality > 0.0:
@@ -259,81 +245,20 @@ def _exchange(
                 if index[n, s] >= 0:
                     bones[size], w[size] = index[n, s], value[n, s]
                     size += 1
-            _form(square, hh, c, e, smoothness, bones, size, q)
-            size = _solve(q, bones, w, size)
-            now = _value(q, w, size)
+            quadratic_form(square, hh, c, e, smoothness, bones, size, q)
+            size = solve(q, bones, w, size)
+            now = value_of(q, w, size)
             for _ in range(rounds):
-                found = _best_bone(square, diagonal, hh, c, e, smoothness, bones, w, size, now, reach, -1)
+                found = best_bone(square, diagonal, hh, c, e, smoothness, bones, w, size, now, reach, -1)
                 if found < 0:
                     break
                 before = now
-                size, now = _bring_in(square, hh, c, e, smoothness, bones, w, size, slots, now, q, found)
+                size, now = bring_in(square, hh, c, e, smoothness, bones, w, size, slots, now, q, found)
                 if now >= before:
                     break
             error[n] = max(now, 0.0)
             for s in range(slots):
                 index[n, s], value[n, s] = (bones[s], w[s]) if s < size else (-1, 0.0)
-
-
-@njit(cache=True, nogil=True, fastmath=FAST)
-def _losses(rest, path, length, frames, linear, square, index, value, loss, start, stop):
-    count, slots = len(square), index.shape[1]
-    raw, correlation = np.empty((_TILE, 4 * count)), np.empty((_TILE, count))
-    hh = np.empty(10)
-    diagonal, reach = np.empty((10, count)), np.empty(count)
-    for b in range(count):
-        for k in range(10):
-            diagonal[k, b] = square[b, k, b]
-    bones, w = np.empty(slots + 1, np.int64), np.empty(slots + 1)
-    q = np.empty((slots + 1, slots + 1))
-    for low in range(start, stop, _TILE):
-        high = min(low + _TILE, stop)
-        _correlate(rest, path, linear, low, high, raw, correlation)
-        for n in range(low, high):
-            c, e = correlation[n - low], length[n] / frames
-            _products_of(rest[n], hh)
-            whole = -1.0
-            for out in range(-1, slots):
-                loss_of_all = out < 0
-                if not loss_of_all and index[n, out] < 0:
-                    loss[n, out] = 0.0
-                    continue
-                size, total = 0, 0.0
-                for s in range(slots):
-                    if index[n, s] >= 0 and s != out:
-                        bones[size], w[size] = index[n, s], value[n, s]
-                        total += w[size]
-                        size += 1
-                banned = -1 if loss_of_all else index[n, out]
-                if size == 0 or total <= 0.0:
-                    bones[0] = _best_alone(diagonal, hh, c, e, banned)
-                    w[0], size, total = 1.0, 1, 1.0
-                for s in range(size):
-                    w[s] /= total
-                _form(square, hh, c, e, 0.0, bones, size, q)
-                size = _solve(q, bones, w, size)
-                now = _value(q, w, size)
-                if loss_of_all:
-                    whole = now
-                    continue
-                found = _best_bone(square, diagonal, hh, c, e, 0.0, bones, w, size, now, reach, banned)
-                if found >= 0:
-                    size, now = _bring_in(square, hh, c, e, 0.0, bones, w, size, slots, now, q, found)
-                loss[n, out] = max(now - whole, 0.0)
-
-
-@njit(cache=True, nogil=True, fastmath=FAST)
-def _best_alone(diagonal, hh, c, e, banned):
-    best, least = 0, np.inf
-    for b in range(diagonal.shape[1]):
-        if b == banned:
-            continue
-        total = e - 2.0 * c[b]
-        for k in range(10):
-            total += hh[k] * diagonal[k, b]
-        if total < least:
-            best, least = b, total
-    return best
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
@@ -349,7 +274,7 @@ def _pull(n, graph, last, smoothness, c):
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _form(square, hh, c, e, smoothness, bones, size, q):
+def quadratic_form(square, hh, c, e, smoothness, bones, size, q):
     """q[:size, :size] = Q among the given bones."""
     for s in range(size):
         for r in range(s, size):
@@ -360,16 +285,7 @@ def _form(square, hh, c, e, smoothness, bones, size, q):
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _value(q, w, size):
-    total = 0.0
-    for s in range(size):
-        for r in range(size):
-            total += w[s] * w[r] * q[s, r]
-    return total
-
-
-@njit(cache=True, nogil=True, fastmath=FAST)
-def _best_bone(square, diagonal, hh, c, e, smoothness, bones, w, size, now, reach, banned):
+def best_bone(square, diagonal, hh, c, e, smoothness, bones, w, size, now, reach, banned):
     """The bone outside the support, and not banned, towards which w^T Q w falls most along a line, or -1."""
     count = len(square)
     shift = e
@@ -402,17 +318,17 @@ def _best_bone(square, diagonal, hh, c, e, smoothness, bones, w, size, now, reac
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _bring_in(square, hh, c, e, smoothness, bones, w, size, slots, now, q, found):
+def bring_in(square, hh, c, e, smoothness, bones, w, size, slots, now, q, found):
     """Adds a bone, solves, and if the support is too large drops the bone that costs least.
 
     The support and weights are left as they were where that brings nothing. Returns size and value.
     """
     old_bones, old_w = bones.copy(), w.copy()
     bones[size], w[size] = found, 0.0
-    _form(square, hh, c, e, smoothness, bones, size + 1, q)
-    new_size = _solve(q, bones, w, size + 1)
+    quadratic_form(square, hh, c, e, smoothness, bones, size + 1, q)
+    new_size = solve(q, bones, w, size + 1)
     if new_size <= slots:
-        value = _value(q, w, new_size)
+        value = value_of(q, w, new_size)
         if value < now:
             return new_size, value
         bones[:], w[:] = old_bones, old_w
@@ -434,86 +350,9 @@ def _bring_in(square, hh, c, e, smoothness, bones, w, size, slots, now, q, found
                     q[left, column] = full_q[s, r]
                     column += 1
             left += 1
-        left = _solve(q, bones, w, left)
-        value = _value(q, w, left)
+        left = solve(q, bones, w, left)
+        value = value_of(q, w, left)
         if value < best:
             best_size, best, best_bones, best_w = left, value, bones.copy(), w.copy()
     bones[:], w[:] = best_bones, best_w
     return best_size, best
-
-
-@njit(cache=True, nogil=True, fastmath=FAST)
-def _solve(q, bones, w, size):
-    """Minimises w^T Q w over the simplex from a feasible w, dropping bones whose weight reaches zero.
-
-    q, bones and w are packed to the bones that stay. Returns their number.
-    """
-    goal, matrix = np.empty(size), np.empty((size, size))
-    while size > 1:
-        top = 0
-        for s in range(1, size):
-            if w[s] > w[top]:
-                top = s
-        _swap(q, bones, w, 0, top, size)
-        _interior(q, goal, matrix, size)
-        step, stop = 1.0, -1
-        for s in range(size):
-            if goal[s] <= 0.0 and w[s] <= step * (w[s] - goal[s]):
-                step, stop = w[s] / (w[s] - goal[s]) if w[s] > goal[s] else 0.0, s
-        for s in range(size):
-            w[s] += step * (goal[s] - w[s])
-        if stop < 0:
-            break
-        _swap(q, bones, w, stop, size - 1, size)
-        size -= 1
-    total = 0.0
-    for s in range(size):
-        w[s] = max(w[s], 0.0)
-        total += w[s]
-    for s in range(size):
-        w[s] /= total
-    return size
-
-
-@njit(cache=True, nogil=True, fastmath=FAST)
-def _interior(q, goal, matrix, size):
-    """goal[:size] minimises w^T Q w with sum w = 1 only: Cholesky on differences from bone 0, the heaviest."""
-    n = size - 1
-    trace = 0.0
-    for s in range(n):
-        for r in range(n):
-            matrix[s, r] = q[s + 1, r + 1] - q[s + 1, 0] - q[0, r + 1] + q[0, 0]
-        goal[s + 1] = q[0, 0] - q[s + 1, 0]
-        trace += matrix[s, s]
-    ridge = _RIDGE * trace / n + 1e-300
-    for s in range(n):
-        matrix[s, s] += ridge
-    for s in range(n):
-        for r in range(s + 1):
-            total = matrix[s, r]
-            for k in range(r):
-                total -= matrix[s, k] * matrix[r, k]
-            matrix[s, r] = np.sqrt(max(total, ridge)) if s == r else total / matrix[r, r]
-    for s in range(n):
-        for k in range(s):
-            goal[s + 1] -= matrix[s, k] * goal[k + 1]
-        goal[s + 1] /= matrix[s, s]
-    for s in range(n - 1, -1, -1):
-        for k in range(s + 1, n):
-            goal[s + 1] -= matrix[k, s] * goal[k + 1]
-        goal[s + 1] /= matrix[s, s]
-    goal[0] = 1.0
-    for s in range(n):
-        goal[0] -= goal[s + 1]
-
-
-@njit(cache=True, nogil=True)
-def _swap(q, bones, w, a, b, size):
-    if a == b:
-        return
-    bones[a], bones[b] = bones[b], bones[a]
-    w[a], w[b] = w[b], w[a]
-    for s in range(size):
-        q[a, s], q[b, s] = q[b, s], q[a, s]
-    for s in range(size):
-        q[s, a], q[s, b] = q[s, b], q[s, a]

@@ -58,6 +58,14 @@ def test_better_than_the_tuned_peer_with_and_without_faces(horse: Motion) -> Non
 
 
 @pytest.mark.slow
+def test_a_cat_whose_legs_touch_needs_no_faces(shared_data: Path) -> None:
+    with np.load(shared_data / "mesh_sequences" / "cat_poses.npz", allow_pickle=False) as data:
+        points, faces = data["vertices"].astype(np.float32), data["faces"].astype(np.int32)
+    cat = Motion("cat_poses", points, faces, np.array([0, len(points)]), ("all",), 24.0)
+    assert error_of(bones_of(replace(cat, faces=None)), cat) < 1.1 * error_of(bones_of(cat), cat)
+
+
+@pytest.mark.slow
 def test_frames_never_seen(horse: Motion) -> None:
     train = horse.take_frames([slice(0, 18)], ["train"])
     test = horse.take_frames([slice(18, 24)], ["test"])

@@ -32,7 +32,7 @@ _FRAMES, _POINTS = 100, 2500  # looked at while bones are pruned; the refit sees
 _REFIT_FRAMES, _REFIT_POINTS = 300, 6000
 _INFLUENCES = 4  # bones a point follows while they are pruned: more let ghosts hide
 _AFTER = 6  # and once they are chosen
-_CLEARLY = 0.9  # of the squared error
+_CLEARLY, _MUCH = 0.9, 0.8  # of the squared error: one spanning tree for another; a spanning tree for the curve's own
 _LIMBS, _TRUNK = 3, 0.3  # the root has at least so many bones round it, and this part of the largest such bone's skin
 _FAR = 0.15  # of the diagonal: farther from its joint, the skin that two bones share says nothing of it
 _GAP = 0.003  # of the diagonal: what taking a joint along its hinge to there may cost
@@ -306,7 +306,7 @@ def _meet(parents: np.ndarray, joints: np.ndarray, weights: np.ndarray, surface:
 
 def _chosen(by_motion: Fit, by_curve: Fit, watched: Watched) -> Fit:
     """The curve's own tree, unless the motion's follows the points clearly better."""
-    return by_motion if _missed(by_motion, watched) < _CLEARLY * _missed(by_curve, watched) else by_curve
+    return by_motion if _missed(by_motion, watched) < _MUCH * _missed(by_curve, watched) else by_curve
 
 
 def _missed(fit: Fit, watched: Watched) -> float:

@@ -75,6 +75,8 @@ def watched() -> bool:
 
 
 lost = threading.Event()  # set when the server stopped answering in the middle of a run
+ASKED_AGAIN = 0.2  # seconds after which an answer is no longer trusted
+_answered: dict[str, float] = {}  # by address, when
 _hasty = contextlib.ExitStack()  # settings from then on
 
 
@@ -85,8 +87,12 @@ def alive() -> bool:
 
     if lost.is_set():
         return False
+    url = PREFECT_API_URL.value()
+    if time.monotonic() - _answered.get(url, -ASKED_AGAIN) < ASKED_AGAIN:
+        return True
     for _ in range(3):  # a busy server may be late once
-        if _answers(PREFECT_API_URL.value()):
+        if _answers(url):
+            _answered[url] = time.monotonic()
             return True
     lost.set()
     logging.disable(logging.CRITICAL)

@@ -6,7 +6,6 @@ import os
 import shlex
 import tempfile
 from dataclasses import dataclass, field, replace
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,8 +16,8 @@ from flows.costs import Past, chains
 from flows.graph import Graph, Node, short
 from flows.progress import Progress
 from flows.runners import in_flight, task_runner
-from flows.server import lost, server
-from flows.stage import Job, run
+from flows.server import lost, server, watched
+from flows.stage import Job, key_of, run
 from flows.stopping import stoppable
 from flows.store import CorruptArtefact, Ref, Store
 from tasks.errors import InputError
@@ -188,12 +187,14 @@ def compute(graph: Graph, config: dict, progress: Progress) -> Outcome:
 
 def _pass(graph: Graph, config: dict, progress: Progress, outcome: Outcome) -> None:
     """One walk over the graph: a node is submitted when its inputs are there, so no worker waits for another, and first
-    the one that begins the longest chain, so that no long stage is left to the end."""
+    the one that begins the longest chain, so that no long stage is left to the end. Where nobody can look at Prefect's
+    pages, what is cached is taken at once, without a task run of its own."""
     from prefect.futures import as_completed
 
     task = stage_task()
     waiting = [n for n in graph.nodes.values() if n.id not in outcome.refs and n.id not in outcome.errors]
-    past = Past(Store(config["store"]["path"]))
+    store, shown = Store(config["store"]["path"]), watched()
+    past = Past(store)
     first = chains(graph, {n.id: past.seconds(n) for n in graph.nodes.values()})
     waiting.sort(key=lambda n: -first[n.id])
     most = in_flight(config["runner"])
@@ -203,14 +204,24 @@ def _pass(graph: Graph, config: dict, progress: Progress, outcome: Outcome) -> N
         events = str(Path(folder) / "events.jsonl")
         progress.follow(events)
         while waiting or running:
-            ready = (n for n in waiting if all(u.id in outcome.refs for u in n.upstream()))
-            for node in list(islice(ready, max(most - len(running), 0))):
+            found = False
+            for node in [n for n in waiting if all(u.id in outcome.refs for u in n.upstream())]:
+                if len(running) >= most:
+                    break
                 waiting.remove(node)
                 job = job_of(node, outcome.refs, config, events)
+                cached = None if shown else store.find(job.stage, key_of(job))
+                if cached:
+                    found = True
+                    outcome.refs[node.id] = cached
+                    progress.done(node, cached)
+                    continue
                 named = task.with_options(name=node.stage, task_run_name=f"{node.title}: {short(node.cases)}")
                 future = named.submit(job, wait_for=[futures[u.id] for u in node.upstream() if u.id in futures])
                 running[future] = node
                 futures[node.id] = future
+            if found:
+                continue  # what stands behind them may be ready now
             if not running:
                 return  # what still waits stands behind a failure
             future = next(iter(as_completed(list(running))))

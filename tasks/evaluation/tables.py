@@ -160,12 +160,17 @@ def unranked(table: Table) -> Table:
 
 
 def digits_for(values: Sequence[float], metric: str) -> int:
-    """Decimals for a column: the metric's own, or as many as give its largest value three significant digits."""
+    """Decimals for a column: the metric's own; else three significant digits of the largest value, two of the smallest.
+
+    The smallest value asks for two more decimals at most: beside 105 mm, 3.5 is told from 4.1, and 0.001 is not.
+    """
     own = metric_of(metric).digits
-    largest = max((abs(v) for v in values), default=0.0)
-    if own is not None or largest == 0.0:
+    sizes = [abs(v) for v in values if v != 0.0]
+    if own is not None or not sizes:
         return own or 0
-    return min(max(2 - math.floor(math.log10(largest)), 0), 8)
+    largest, smallest = (math.floor(math.log10(v)) for v in (max(sizes), min(sizes)))
+    least = min(max(2 - largest, 0), 8)
+    return max(least, min(1 - smallest, least + 2, 8))
 
 
 def _measured(rows: pd.DataFrame, metrics: Sequence[str]) -> dict[Place, dict[Row, tuple[Cell, str]]]:

@@ -18,6 +18,7 @@ def animate(
     rate: float,
     represent: Literal["root", "residual"],
     dynamics: bool,
+    mirror: bool,
     seed: int,
 ) -> Animation:
     """Poses -> points: one recurrent layer and a linear head give six numbers a bone, then skinning by W
@@ -36,4 +37,5 @@ def animate(
 
         return Recurrent()
 
-    return animate_with(make, training, query, Recipe(hidden, steps, patience, rate, represent, dynamics, seed))
+    recipe = Recipe(hidden, steps, patience, rate, represent, dynamics, mirror, seed)
+    return animate_with(make, training, query, recipe)

@@ -21,14 +21,15 @@ def animate(
     rate: float,
     represent: Literal["root", "residual"],
     dynamics: bool,
+    mirror: bool,
     seed: int,
 ) -> Animation:
     """Poses -> points: three hidden layers give six numbers a bone, then skinning by W (GaussiAnimate 4.1).
 
     hidden: units of a layer; steps, patience, rate: of Adam, stopped by a held-back training clip;
     represent: bones relative to the model's ``root`` or their ``residual`` on the skeleton's skinning;
-    dynamics: also show it the root's velocity, acceleration and angular velocity. Raises InputError for bad poses
-    and numbers out of range.
+    dynamics: also show it the root's velocity, acceleration and angular velocity; mirror: train on the clips' mirror
+    images as well, where the character is symmetric. Raises InputError for bad poses and numbers out of range.
     """
 
     def make(inputs: int, width: int, outputs: int):
@@ -38,4 +39,5 @@ def animate(
         layers = [layer for a, b in pairwise(sizes) for layer in (nn.Linear(a, b), nn.ReLU())]
         return nn.Sequential(*layers, nn.Linear(width, outputs))
 
-    return animate_with(make, training, query, Recipe(hidden, steps, patience, rate, represent, dynamics, seed))
+    recipe = Recipe(hidden, steps, patience, rate, represent, dynamics, mirror, seed)
+    return animate_with(make, training, query, recipe)

@@ -12,6 +12,7 @@ import numpy as np
 from tasks.errors import InputError
 from tasks.geometry.rotations import to_rotation_vector
 from tasks.geometry.skinning import skin
+from tasks.motion.mirror import mirrored
 from tasks.motion.posed import Posed
 from tasks.motion.query import check_poses
 from tasks.motion.regression import bone_radii, from_numbers, to_numbers
@@ -28,7 +29,7 @@ WARM_UP = 8  # frames that a recurrent net sees before its error counts
 @dataclass(frozen=True)
 class Recipe:
     """How to train. hidden: width; steps: most optimiser steps; patience: steps without gain before stopping;
-    rate: Adam's; represent, dynamics: as for the other methods; seed: of the net and of the validation clip."""
+    rate: Adam's; represent, dynamics, mirror: as for the other methods; seed: of the net and of the validation clip."""
 
     hidden: int
     steps: int
@@ -36,6 +37,7 @@ class Recipe:
     rate: float
     represent: str
     dynamics: bool
+    mirror: bool
     seed: int
 
     def __post_init__(self) -> None:
@@ -55,19 +57,25 @@ def animate_with(
     """Trains make(inputs, hidden, outputs) on the database and poses the query with it.
 
     Inputs and outputs are standardised over the training frames. Training stops when one clip, drawn by the seed and
-    held back (the last fifth of the only clip where there is one), stops getting better; the net is then trained
-    anew on all frames for as many steps. Raises InputError for bad poses.
+    held back with its mirror image (the last fifth of the only clip where there is one), stops getting better; the
+    net is then trained anew on all frames for as many steps. Raises InputError for bad poses.
     """
     check_poses(query, training.skeleton, "query")
     known, asked = Posed(training, training.database.poses), Posed(training, query)
-    x, z = (_inputs(posed, recipe.dynamics) for posed in (known, asked))
+    image = mirrored(training) if recipe.mirror else None
+    learnt = [(known, training.database.bones)]
+    learnt += [] if image is None else [(Posed(training, image[0], known), image[1])]
     radius = bone_radii(training.skinning.rest, training.skinning.weights)
     length = np.repeat([radius, np.ones_like(radius)], 3, axis=0).T  # (B, 6): turns as the way that points go
-    y = to_numbers(known.encode(training.database.bones, recipe.represent)) * length
+    x = np.concatenate([_inputs(posed, recipe.dynamics) for posed, _ in learnt])
+    y = np.concatenate([to_numbers(posed.encode(bones, recipe.represent)) * length for posed, bones in learnt])
     y = y.reshape(len(y), -1)
+    z = _inputs(asked, recipe.dynamics)
     x_mean, x_unit, y_mean, y_unit = x.mean(0), _unit(x), y.mean(0), _unit(y)
-    clips = [(slice(int(a), int(b))) for a, b in pairwise(known.poses.clip_start)]
-    data = [((x[c] - x_mean) / x_unit, (y[c] - y_mean) / y_unit) for c in clips]
+    x, y = (x - x_mean) / x_unit, (y - y_mean) / y_unit
+    starts = np.arange(len(learnt)) * len(known.world)  # a clip's image follows as many frames later
+    clips = [[slice(int(s + a), int(s + b)) for s in starts] for a, b in pairwise(known.poses.clip_start)]
+    data = [[(x[c], y[c]) for c in both] for both in clips]
     asked_clips = [(z[a:b] - x_mean) / x_unit for a, b in pairwise(query.clip_start)]
     made = np.concatenate(_train_and_ask(make, data, asked_clips, recipe)) * y_unit + y_mean
     bones = asked.decode(from_numbers(made.reshape(len(made), -1, 6) / length), recipe.represent).astype(np.float32)
@@ -99,7 +107,7 @@ def _train_and_ask(make, data: list, asked: list[np.ndarray], recipe: Recipe) ->
     try:
         train, held = _hold_back(data, np.random.default_rng(recipe.seed))
         best, _ = _descend(make, train, held, recipe.steps, recipe)
-        _, net = _descend(make, data, [], best, recipe)
+        _, net = _descend(make, [clip for both in data for clip in both], [], best, recipe)
         with torch.no_grad():
             return [net(torch.from_numpy(q[None].astype(np.float32)))[0].double().numpy() for q in asked]
     finally:
@@ -107,11 +115,13 @@ def _train_and_ask(make, data: list, asked: list[np.ndarray], recipe: Recipe) ->
 
 
 def _hold_back(data: list, rng: np.random.Generator) -> tuple[list, list]:
+    """Clips to train on, images included, and the clip to look at; data: of each clip itself and its image, if any."""
     if len(data) > 1:
         held = int(rng.integers(len(data)))
-        return [d for i, d in enumerate(data) if i != held], [data[held]]
-    (x, y), cut = data[0], max(1, len(data[0][0]) * 4 // 5)
-    return [(x[:cut], y[:cut])], [(x[cut:], y[cut:])] if cut < len(x) else []
+        return [clip for i, both in enumerate(data) if i != held for clip in both], [data[held][0]]
+    (x, y), cut = data[0][0], max(1, len(data[0][0][0]) * 4 // 5)
+    train = [(x[:cut], y[:cut]) for x, y in data[0]]
+    return train, [(x[cut:], y[cut:])] if cut < len(x) else []
 
 
 def _descend(make, data: list, held: list, steps: int, recipe: Recipe) -> tuple[int, torch.nn.Module]:

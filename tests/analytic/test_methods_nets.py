@@ -20,6 +20,7 @@ SMALL = {
     "rate": 0.01,
     "represent": "residual",
     "dynamics": False,
+    "mirror": False,
     "seed": 0,
 }
 NETS = [mlp, gru]
@@ -63,11 +64,20 @@ def test_the_held_back_clip_stops_the_training():
 
     rng = np.random.default_rng(0)
     noise = [(rng.normal(size=(30, 4)), rng.normal(size=(30, 2))) for _ in range(2)]
-    recipe = nets.Recipe(64, 400, 40, 0.01, "root", False, 0)
+    recipe = nets.Recipe(64, 400, 40, 0.01, "root", False, False, 0)
     best, _ = nets._descend(lambda i, h, o: torch.nn.Linear(i, o), noise[:1], noise[1:], 400, recipe)
     assert best < 400
     unseen, _ = nets._descend(lambda i, h, o: torch.nn.Linear(i, o), noise, [], 7, recipe)
     assert unseen == 7
+
+
+def test_a_clip_is_held_back_with_its_image_and_seen_alone():
+    clips = [[(np.full((5, 1), c), np.full((5, 1), side)) for side in (0, 1)] for c in range(3)]
+    train, held = nets._hold_back(clips, np.random.default_rng(0))
+    (drawn, side), trained = (int(held[0][0][0, 0]), held[0][1][0, 0]), [int(x[0, 0]) for x, _ in train]
+    assert len(held) == 1
+    assert side == 0
+    assert sorted(trained) == sorted(2 * [c for c in range(3) if c != drawn])
 
 
 def test_one_clip_and_dynamics(train):

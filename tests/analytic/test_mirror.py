@@ -9,7 +9,7 @@ import pytest
 
 from tasks.geometry.measure import vertex_rmse
 from tasks.geometry.skinning import skin
-from tasks.methods import part_kernel
+from tasks.methods import mlp, part_kernel
 from tasks.motion.database import build_database
 from tasks.motion.mirror import mirrored
 from tasks.motion.posed import Posed
@@ -20,7 +20,7 @@ FLIP = np.diag([-1.0, 1.0, 1.0]).astype(np.float32)
 PAIRS = np.array(
     [planted.NAMES.index(n[:-1] + {"l": "r", "r": "l"}.get(n[-1], n[-1]) if n[-2] == "_" else n) for n in planted.NAMES]
 )
-SETTINGS = {
+KERNEL = {
     "represent": "residual",
     "dynamics": 0.0,
     "reach": 0,
@@ -28,6 +28,15 @@ SETTINGS = {
     "ridge": 1e-4,
     "tune": False,
     "landmarks": 1000,
+}
+NET = {
+    "hidden": 32,
+    "steps": 200,
+    "patience": 200,
+    "rate": 0.01,
+    "represent": "residual",
+    "dynamics": False,
+    "seed": 0,
 }
 
 
@@ -82,7 +91,8 @@ def test_the_image_of_a_motion_is_what_the_image_of_its_poses_would_do(symmetric
     np.testing.assert_allclose(bones, moved(symmetric, expected), atol=1e-4)
 
 
-def test_what_the_left_arm_did_is_known_of_the_right(symmetric):
+@pytest.mark.parametrize(("method", "settings"), [(part_kernel, KERNEL), (mlp, NET)])
+def test_what_the_left_arm_did_is_known_of_the_right(symmetric, method, settings):
     """The right arm rests in training and moves in the query: only the mirror image says what it does."""
     poses, right = symmetric.database.poses, [planted.NAMES.index(f"{n}_r") for n in ("arm", "elbow", "hand")]
     still = poses.rotations.copy()
@@ -90,7 +100,7 @@ def test_what_the_left_arm_did_is_known_of_the_right(symmetric):
     training = trained(symmetric, replace(poses, rotations=still))
     query = image(Poses(still[:60], poses.translations[:60], np.array([0, 60])))
     truth = skin(training.skinning.rest, training.skinning.weights, moved(symmetric, query))
-    error = {m: vertex_rmse(part_kernel.animate(training, query, **SETTINGS, mirror=m).points, truth) for m in (0, 1)}
+    error = {m: vertex_rmse(method.animate(training, query, **settings, mirror=m).points, truth) for m in (0, 1)}
     assert error[1] < 0.2 * error[0]
 
 

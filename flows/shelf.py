@@ -7,8 +7,9 @@ from pathlib import Path
 from flows import config
 from flows.batch import Batch, Experiment
 from flows.config import Case, Missing
+from flows.contents import paper_numbers, places, tables_of
 from flows.provenance import command
-from flows.reporting import Report, paper_numbers, places, tables_of
+from flows.reporting import Report
 from tasks.errors import InputError
 
 PLACES = ("data_root", "store.path", "report.path", "runner", "runner.workers", "runner.address")  # change no number

@@ -97,7 +97,7 @@ def _reset_peak() -> float | None:
             file.write("5")
     except OSError:
         return None
-    return _status("VmRSS")
+    return in_use()
 
 
 def in_use() -> float | None:

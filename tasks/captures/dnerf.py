@@ -41,7 +41,7 @@ def load(
 ) -> tuple[Capture, Capture]:
     """(train, test) captures of a folder in the layout above, the world turned so that up is +Y.
 
-    size: pixels of the longer side that images are brought down to, null as they are. background: behind images without
+    size: of the longer side at most: larger images are brought down; null: none are. background: behind images without
     alpha, which are refused when it is none; with alpha, none is white. up: the axis of the file's world that is up.
     fps: where the file does not say; the times of both halves are one list, so a frame is the same time in both.
     Raises InputError for missing or unreadable files and for all that :mod:`validate` checks.

@@ -117,7 +117,7 @@ def read_json(file: Path) -> dict:
 def read_stack(
     files: list[Path], size: int | None, mask_of: Callable[[Path], np.ndarray] | None = None
 ) -> tuple[np.ndarray, bool, tuple[int, int]]:
-    """Images of one size, brought down to `size` pixels along the longer side, null as they are: (I, H, W, 4), whether
+    """Images of one size, of at most `size` pixels along the longer side (null: as they are): (I, H, W, 4), whether
     they have alpha, and height and width in the files. mask_of: gives the alpha (H, W) of an image that has none."""
     images, alpha, shape = [], None, None
     for file in files:
@@ -131,7 +131,7 @@ def read_stack(
         if own != alpha:
             found = f"alpha in {(file if own else files[0]).name} and none in {(files[0] if own else file).name}"
             raise InputError(str(file), expected="alpha in all images or in none", found=found)
-        images.append(resize(image, *_scaled(shape, size, file)))
+        images.append(resize(image, *_scaled(shape, size)))
     return np.stack(images), alpha, shape
 
 
@@ -142,9 +142,9 @@ def _masked(image: np.ndarray, mask: np.ndarray, file: Path) -> np.ndarray:
     return np.concatenate([image[:, :, :3], mask[:, :, None]], 2)
 
 
-def _scaled(shape: tuple[int, int], size: int | None, file: Path) -> tuple[int, int]:
-    if size is None:
+def _scaled(shape: tuple[int, int], size: int | None) -> tuple[int, int]:
+    if size is not None and size < 1:
+        raise InputError("dataset.size", expected="1 pixel or more, or null", found=str(size))
+    if size is None or size >= max(shape):
         return shape
-    if not 0 < size <= max(shape):
-        raise InputError("dataset.size", expected=f"1 to {max(shape)} pixels", found=f"{size}, for {file.name}")
     return tuple(max(1, round(n * size / max(shape))) for n in shape)

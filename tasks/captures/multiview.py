@@ -50,7 +50,7 @@ UNREADABLE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
 def load(*, path: str, size: int | None, background: Literal["none", "white", "black"]) -> tuple[Capture, Capture]:
     """(train, test) captures of a folder in the layout above.
 
-    size: pixels of the longer side that images are brought down to, null as they are; background: behind images without
+    size: of the longer side at most: larger images are brought down; null: none are; background: behind images without
     alpha and masks, which are refused when it is none; with alpha, none is white. Raises InputError for missing
     cameras, frames and masks, for unreadable files and for all that :mod:`validate` checks.
     """

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -14,38 +15,52 @@ from tasks.geometry import kinematics
 from tasks.geometry.rotations import from_rotation_vector, project_so3, to_rotation_vector
 from tasks.values import About, Motion, Poses, Skeleton
 
+WORD = re.compile(r"[^\W_]+")  # of any script
+CAMEL = re.compile(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])")  # where a word begins within LHipJoint
+SIDES = {"l": "left", "left": "left", "r": "right", "right": "right"}
 ARRAYS = ("joint_names", "joint_parents", "joints", "joint_rotations", "joint_translations", "fps")
 EXPECTED = "a .bvh or .npz file of poses"
 ROUNDED = 1e-2  # of a frame: files give the frame time in few digits
+SLOWEST = 0.1  # frames a second of a file: below it is no motion, and filling in between would take all memory
+LYING = 0.7  # of a length: a body that leans so far towards a side in the median lies there
 LEAST = 0.5  # of the joints that move skin: with fewer matched it is another creature
 
 
 def driving_poses(
-    skeleton: Skeleton, train: Motion, *, path: str | None, rename: list[str], first: int, frames: int | None
+    skeleton: Skeleton,
+    train: Motion,
+    *,
+    path: str | None,
+    rename: list[str],
+    up: Literal["y", "z"],
+    first: int,
+    frames: int | None,
 ) -> tuple[Motion, Poses, About]:
     """The motion of a file on this skeleton: its joints' path (F, J, 3) as a motion, the poses, and what was left out.
 
     path: a .bvh, or an .npz as the export writes it (joint_names, joint_parents, joints, joint_rotations,
-    joint_translations, fps). Joints are matched by name, whatever their order; capitals, separators and a prefix before
-    ":" do not count. rename: "theirs=ours" where names differ. Joints without a counterpart keep their rest pose. Each
-    matched joint takes the driver's rotation in the world, after its own bones at rest have been turned onto the
-    driver's; the lowest joint keeps the driver's height above the ground, scaled. Sampled at the training data's rate.
-    first, frames: where to begin, captures often have a T pose in front, and how many at most.
+    joint_translations, fps). Joints are matched by name, whatever their order; capitals, separators, a prefix before
+    ":" and how left and right are written do not count. rename: "theirs=ours" where names differ. Joints without a
+    counterpart keep their rest pose. Each matched joint takes the driver's rotation in the world, after its own bones
+    at rest have been turned onto the driver's; the root takes its counterpart's path, and the lowest joint keeps the
+    driver's height above the ground, both scaled. up: the file's axis that points up. Sampled at the training data's
+    rate. first, frames: where to begin, captures often have a T pose in front, and how many at most.
     Raises InputError where the file cannot be read or too few names match.
     """
     source = existing(path)
-    driver = _sampled(
-        read_bvh(source) if source.suffix.lower() == ".bvh" else _read_npz(source), train.fps, first, frames
-    )
+    driver = read_bvh(source) if source.suffix.lower() == ".bvh" else _read_npz(source)
+    driver = _sampled(_upright(driver) if up == "z" else driver, train.fps, first, frames)
     match = match_names(skeleton, driver.names, rename, where=str(source))
     poses = retarget(skeleton, driver, match)
     turned = kinematics.forward(skeleton.parents, skeleton.joints, poses.rotations, poses.translations)
     at = kinematics.joint_positions(turned, skeleton.joints)
     name = re.sub(r"\s+", "_", source.stem)
     left = [skeleton.names[j] for j in np.flatnonzero((match < 0) & (skeleton.weights.sum(0) > 0))]
-    notes = (f"driven by {name}, {len(at)} frames", *((f"joints left at rest: {', '.join(left)}",) if left else ()))
+    notes = [f"driven by {name}, {len(at)} frames"]
+    notes += [f"joints left at rest: {', '.join(left)}"] if left else []
+    notes += ["lies on its back or belly in most frames: where the file's Z is up, say drive.up=z"] * _lies(turned)
     motion = Motion(name, at.astype(np.float32), None, poses.clip_start, (name,), train.fps, train.unit)
-    return motion, poses, About(train.name, notes)
+    return motion, poses, About(train.name, tuple(notes))
 
 
 def existing(path: str | None) -> Path:
@@ -98,12 +113,12 @@ def retarget(skeleton: Skeleton, driver: Driver, match: np.ndarray) -> Poses:
         ours[:, j] = world[:, match[j]] @ into_line[j] if match[j] >= 0 else above
         local[:, j] = np.swapaxes(above, -1, -2) @ ours[:, j]
     shift = np.zeros((frames, len(parents), 3))
-    shift[:, 0] = scale * (driver.root - driver.root[0])
+    places = _places(driver.parents, driver.joints, driver.rotations, driver.translations)
+    shift[:, 0] = scale * (places[:, match[0]] - places[:1, match[0]])
     shift[:, 0, 1] = 0
-    low = _lowest(parents, rest, local, shift)
-    theirs = np.zeros((frames, len(driver.parents), 3))
-    theirs[:, 0] = driver.root - driver.joints[0]
-    height = _lowest(driver.parents, driver.joints, driver.rotations, theirs)
+    low = _places(parents, rest, local, shift)[..., 1].min(1)
+    body = np.setdiff1d(np.arange(len(driver.parents)), _above(driver.parents, match[0]))
+    height = places[:, body, 1].min(1)
     shift[:, 0, 1] = rest[:, 1].min() + scale * (height - height.min()) - low
     clip = np.array([0, frames], np.int64)
     return Poses(project_so3(local).astype(np.float32), shift.astype(np.float32), clip)
@@ -126,7 +141,8 @@ def _into_line(parents: np.ndarray, rest: np.ndarray, driver: Driver, match: np.
         if len(ends) > 1 and spread[1] > 0.3:  # two directions and more decide a rotation
             out[j] = project_so3(b.T @ a)
         else:
-            out[j] = _onto(a.mean(0), b.mean(0))
+            before = out[p] if p >= 0 else np.eye(3)  # about their own axis, limbs turn as what they hang on
+            out[j] = _onto(before @ a.mean(0), b.mean(0)) @ before
     return out, float(own / max(theirs, 1e-9))
 
 
@@ -160,26 +176,48 @@ def _onto(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return from_rotation_vector(axis / max(np.linalg.norm(axis), 1e-12) * np.arctan2(sine, cosine))
 
 
-def _lowest(parents: np.ndarray, rest: np.ndarray, rotations: np.ndarray, translations: np.ndarray) -> np.ndarray:
-    """The height of the lowest joint in each frame. (F,)"""
-    posed = kinematics.forward(parents, rest, rotations, translations)
-    return kinematics.joint_positions(posed, rest)[..., 1].min(1)
+def _places(parents: np.ndarray, rest: np.ndarray, rotations: np.ndarray, translations: np.ndarray) -> np.ndarray:
+    """Where the joints are in each frame. (F, J, 3)"""
+    return kinematics.joint_positions(kinematics.forward(parents, rest, rotations, translations), rest)
+
+
+def _above(parents: np.ndarray, joint: int) -> list[int]:
+    """What a joint hangs on: nodes that stand still under a moving body, as some programs write them."""
+    found = []
+    while (joint := int(parents[joint])) >= 0:
+        found.append(joint)
+    return found
+
+
+def _lies(turned: np.ndarray) -> bool:
+    """Whether the root, upright at rest, has its own up along Z in most frames. turned: (F, J, 3, 4)"""
+    return bool(np.abs(np.median(turned[:, 0, 2, 1])) > LYING)
+
+
+def _upright(driver: Driver) -> Driver:
+    """A motion whose Z is up, with Y up: x y z -> x z -y."""
+    turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    joints, moved = driver.joints @ turn.T, driver.translations @ turn.T
+    return replace(driver, joints=joints, rotations=turn @ driver.rotations @ turn.T, translations=moved)
 
 
 def _sampled(driver: Driver, fps: float, first: int, frames: int | None) -> Driver:
     """The same motion at another rate, from a frame on, cut to so many frames."""
     if frames is not None and frames < 1:
         raise InputError("drive.frames", expected="1 or more, or null for all", found=str(frames))
-    last = len(driver.root) - 1
+    if not driver.fps >= SLOWEST:
+        raise InputError("drive.path: frame time", expected=f"at most {1 / SLOWEST:g} s", found=f"{1 / driver.fps:g} s")
+    last = len(driver.rotations) - 1
     count = int(np.floor(last * fps / driver.fps + ROUNDED)) + 1
     if not 0 <= first < count:
         raise InputError("drive.first", expected=f"0 to {count - 1}", found=str(first))
     at = np.minimum(np.arange(count)[first:][:frames] * (driver.fps / fps), last)
     a = np.minimum(at.astype(int), max(last - 1, 0))
-    b, t = np.minimum(a + 1, last), (at - a)[:, None]
+    b, t = np.minimum(a + 1, last), (at - a)[:, None, None]
     step = to_rotation_vector(np.swapaxes(driver.rotations[a], -1, -2) @ driver.rotations[b])
-    rotations = driver.rotations[a] @ from_rotation_vector(t[..., None] * step)
-    return replace(driver, rotations=rotations, root=(1 - t) * driver.root[a] + t * driver.root[b], fps=fps)
+    rotations = driver.rotations[a] @ from_rotation_vector(t * step)
+    moved = (1 - t) * driver.translations[a] + t * driver.translations[b]
+    return replace(driver, rotations=rotations, translations=moved, fps=fps)
 
 
 def _read_npz(path: Path) -> Driver:
@@ -210,13 +248,16 @@ def _read_npz(path: Path) -> Driver:
         f, j = np.unravel_index(int(np.nanargmax(np.where(np.isfinite(off), off, np.inf))), off.shape)
         found = f"frame {f}, joint {names[j]}"
         raise InputError(f"{path}: joint_rotations", expected="rotation matrices", found=found)
-    root = joints[0] + moved[:, 0]
-    place = joints.astype(np.float64)
-    return Driver(
-        tuple(map(str, names)), parents, place, rotations.astype(np.float64), root.astype(np.float64), float(fps)
-    )
+    joints, rotations, moved = (array.astype(np.float64) for array in (joints, rotations, moved))
+    return Driver(tuple(map(str, names)), parents, joints, rotations, moved, float(fps.item()))
 
 
 def _plain(name: str) -> str:
-    """A joint's name without prefix, separators and capitals."""
-    return re.sub(r"[^a-z0-9]", "", name.rpartition(":")[2].lower().removeprefix("mixamorig"))
+    """A joint's name without prefix, separators and capitals, its side in front: mixamorig:LeftArm, arm.L and l_arm
+    are one."""
+    words = [w.lower() for w in WORD.findall(CAMEL.sub(" ", name.rpartition(":")[2]))]
+    words = words[1:] if words[:1] == ["mixamorig"] else words
+    if len(words) > 1:
+        at = next((at for at in (0, -1) if words[at] in SIDES), None)
+        words = words if at is None else [SIDES[words.pop(at)], *words]
+    return "".join(words) or name

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -39,7 +41,9 @@ def training(frames: int = 40) -> Motion:
 
 def drive(path, ours: Skeleton | None = None, **changed):
     return driving_poses(
-        ours or skeleton(), training(), **{"path": str(path), "rename": [], "first": 0, "frames": None} | changed
+        ours or skeleton(),
+        training(),
+        **{"path": str(path), "rename": [], "up": "y", "first": 0, "frames": None} | changed,
     )
 
 
@@ -60,7 +64,9 @@ def test_a_written_bvh_is_read_back(tmp_path):
     assert read.fps == pytest.approx(FPS)
     assert geodesic(read.rotations, poses.rotations).max() < 1e-4
     np.testing.assert_allclose(read.joints[1:] - read.joints[0], T_POSE[1:] - T_POSE[0], atol=1e-5)
-    np.testing.assert_allclose(read.root, T_POSE[0] + poses.translations[:, 0], atol=1e-5)
+    np.testing.assert_allclose(
+        read.joints[0] + read.translations[:, 0], T_POSE[0] + poses.translations[:, 0], atol=1e-5
+    )
 
 
 def test_channels_in_their_own_order(tmp_path):
@@ -74,7 +80,7 @@ def test_channels_in_their_own_order(tmp_path):
     x, z, y = (from_rotation_vector(a * axis) for a, axis in angles)
     np.testing.assert_allclose(read.rotations[0, 0], x @ z @ y, atol=1e-12)
     assert read.names == ("a_b", "c")
-    assert read.root.tolist() == [[1, 2, 7]]
+    assert read.translations.tolist() == [[[0, 0, 4], [0, 0, 0]]]
     assert read.fps == pytest.approx(20)
 
 
@@ -132,6 +138,86 @@ def test_a_driver_that_looks_elsewhere_at_rest_turns_the_character(tmp_path):
     np.testing.assert_allclose(motion.points[0] - motion.points[0, 0], aside - aside[0], atol=1e-4)
 
 
+def test_limbs_of_a_driver_that_looks_backwards_turn_with_the_body(tmp_path):
+    """Down is down wherever one looks: where the legs point does not tell that the thighs have turned as well."""
+    back = (T_POSE * [-1, 1, -1]).astype(np.float32)
+    still = Poses(np.tile(np.eye(3, dtype=np.float32), (2, 6, 1, 1)), np.zeros((2, 6, 3), np.float32), np.array([0, 2]))
+    (tmp_path / "t.bvh").write_text(bvh.write_bvh(skeleton(back), still, slice(0, 2), fps=FPS))
+    _, poses, _ = drive(tmp_path / "t.bvh")
+    turned = kinematics.forward(PARENTS, T_POSE, poses.rotations, poses.translations)
+    np.testing.assert_allclose(turned[0, :, :, :3], np.tile(np.diag([-1.0, 1, -1]), (6, 1, 1)), atol=1e-5)
+
+
+def nested(pose: Poses) -> str:
+    """A BVH whose root, a node on the ground, stands still, while the hips carry the path."""
+    text = bvh.write_bvh(skeleton(), pose, slice(0, len(pose.rotations)), fps=FPS)
+    head, motion = text.split("MOTION")
+    still = "HIERARCHY\nROOT Reference\n{\n OFFSET 0 0 0\n CHANNELS 6 Xposition Yposition Zposition " + (
+        "Zrotation Xrotation Yrotation\n"
+    )
+    inner = head.removeprefix("HIERARCHY").replace("ROOT Hips", "JOINT Hips")
+    counts, rows = motion.split("\n")[1:3], motion.split("\n")[3:-1]
+    return "\n".join([still + inner + "}", "MOTION", *counts, *(f"0 0 0 0 0 0 {row}" for row in rows)]) + "\n"
+
+
+def test_the_path_of_the_hips_counts_though_they_hang_on_another_node(tmp_path):
+    poses = walk()
+    poses.translations[20, 0, 1] += 3  # a jump
+    (tmp_path / "plain.bvh").write_text(bvh.write_bvh(skeleton(), poses, slice(0, 40), fps=FPS))
+    (tmp_path / "nested.bvh").write_text(nested(poses))
+    plain, _, _ = drive(tmp_path / "plain.bvh")
+    below, _, about = drive(tmp_path / "nested.bvh")
+    assert np.ptp(plain.points[:, 0, 1]) > 2.5
+    np.testing.assert_allclose(below.points, plain.points, atol=1e-4)
+    assert len(about.notes) == 1
+
+
+def test_a_file_whose_z_is_up(tmp_path):
+    poses = walk()
+    turn = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # x y z with Y up -> x -z y
+    lying = Poses((turn @ poses.rotations @ turn.T).astype(np.float32), poses.translations @ turn.T, poses.clip_start)
+    on_its_back = skeleton((T_POSE @ turn.T).astype(np.float32))
+    (tmp_path / "y.bvh").write_text(bvh.write_bvh(skeleton(), poses, slice(0, 40), fps=FPS))
+    (tmp_path / "z.bvh").write_text(bvh.write_bvh(on_its_back, lying, slice(0, 40), fps=FPS))
+    upright, _, _ = drive(tmp_path / "y.bvh")
+    motion, _, about = drive(tmp_path / "z.bvh", up="z")
+    np.testing.assert_allclose(motion.points, upright.points, atol=1e-4)
+    assert len(about.notes) == 1
+    _, _, about = drive(tmp_path / "z.bvh")
+    assert "drive.up=z" in about.notes[1]
+
+
+@pytest.mark.parametrize(
+    ("theirs", "ours", "matched"),
+    [
+        ("mixamorig:LeftArm", "LeftArm", True),
+        ("mixamorig_LeftArm", "left_arm", True),
+        ("arm.L", "LeftArm", True),
+        ("R_Arm", "rightArm", True),
+        ("LArm", "LeftArm", True),
+        ("arm.R", "LeftArm", False),
+        ("Spine1", "Spine", False),
+        ("骨盆", "Hüfte", False),  # names of no Latin letter are names all the same
+        ("骨盆", "骨盆", True),
+    ],
+)
+def test_names_as_other_programs_write_them(theirs, ours, matched):
+    two = Skeleton(("Hips", ours), np.array([-1, 0]), T_POSE[:2], np.eye(2, dtype=np.float32))
+    assert match_names(two, ("hips", theirs), [], where="").tolist() == [0, 1 if matched else -1]
+
+
+def test_texts_that_programs_write_differently(tmp_path):
+    good = bvh.write_bvh(skeleton(), walk(), slice(0, 40), fps=FPS)
+    (tmp_path / "w.bvh").write_text(good)
+    plain, _, _ = drive(tmp_path / "w.bvh")
+    for text in (good.replace("\n", "\r\n"), "\ufeff" + good, good.replace("\n", "\n\n"), good.replace("  ", "\t")):
+        (tmp_path / "w.bvh").write_bytes(text.encode())
+        other, _, _ = drive(tmp_path / "w.bvh")
+        np.testing.assert_array_equal(other.points, plain.points)
+    (tmp_path / "w.bvh").write_text(good.replace("ROOT Hips", "ROOT LOCOMOTION_Hips"))
+    assert read_bvh(tmp_path / "w.bvh").names[0] == "LOCOMOTION_Hips"
+
+
 def test_joints_without_a_counterpart_stay_at_rest_and_are_named(tmp_path):
     (tmp_path / "w.bvh").write_text(bvh.write_bvh(skeleton(), walk(), slice(0, 40), fps=FPS))
     odd = Skeleton(
@@ -151,7 +237,8 @@ def test_bad_files_and_names(tmp_path):
     path.write_text(good)
     rejects(lambda: drive(tmp_path / "none.bvh"), "no such file")
     rejects(
-        lambda: driving_poses(skeleton(), training(), path=None, rename=[], first=0, frames=None), "drive.path=FILE"
+        lambda: driving_poses(skeleton(), training(), path=None, rename=[], up="y", first=0, frames=None),
+        "drive.path=FILE",
     )
     rejects(lambda: drive(path, frames=0), "drive.frames", "1 or more")
     rejects(lambda: drive(path, first=40), "drive.first", "0 to 39")
@@ -168,9 +255,16 @@ def test_bad_files_and_names(tmp_path):
         (good.replace("Zrotation", "Wrotation", 1), "unknown channel 'Wrotation'"),
         (good.rpartition(" ")[0] + " nan\n", "others in frame 39"),
         (good.replace("OFFSET", "OFSET", 1), "damaged text"),
+        (good.replace("CHANNELS 3", "CHANNELS -2", 1), "-2 channels"),
+        (good.replace("OFFSET 0.000000", "OFFSET nan", 1), "an OFFSET that is not finite"),
+        (good.replace("}\nMOTION", "MOTION"), "no end of joint 'Hips'"),
+        (good.replace("Frames: 40", "Frames: 0"), "1 frames of 21 numbers, and a frame time, found"),
+        (re.sub("Frame Time: .*", "Frame Time: inf", good), "a frame time"),
     ):
         path.write_text(text)
         rejects(lambda: drive(path), "w.bvh", words)
+    path.write_text(re.sub("Frame Time: .*", "Frame Time: 1e30", good))
+    rejects(lambda: drive(path), "frame time", "at most 10 s")
     exported(tmp_path / "p.npz", walk(), list(range(6)))
     with np.load(tmp_path / "p.npz") as archive:
         arrays = dict(archive)
@@ -191,7 +285,7 @@ def test_a_capture_drives_the_body_of_the_garments(shared_data):
     rig = motion.rig
     ours = Skeleton(rig.names, rig.parents, rig.joints, rig.weights)
     path = shared_data / "mocap_cmu" / "01_01.bvh"
-    made, _, about = driving_poses(ours, motion, path=str(path), rename=[], first=0, frames=None)
+    made, _, about = driving_poses(ours, motion, path=str(path), rename=[], up="y", first=0, frames=None)
     assert made.frames == 688  # 2,752 at 120 a second
     assert about.notes[1] == "joints left at rest: Spine2"
     assert made.points[..., 1].min() == pytest.approx(rig.joints[:, 1].min(), abs=1e-4)
@@ -201,5 +295,5 @@ def test_a_capture_drives_the_body_of_the_garments(shared_data):
     step = np.linalg.norm(np.diff(made.points, axis=0), axis=2) * motion.fps
     assert step[0].max() > 15  # the file begins with a T pose, as captures do
     assert step[1:].max() < 9
-    later, _, _ = driving_poses(ours, motion, path=str(path), rename=[], first=1, frames=5)
+    later, _, _ = driving_poses(ours, motion, path=str(path), rename=[], up="y", first=1, frames=5)
     np.testing.assert_allclose(later.points[..., 1], made.points[1:6, :, 1], atol=0.05)

@@ -45,14 +45,6 @@ class Alignment:
         shift = self.scale * local[..., 3] + self.centre - local[..., :3] @ self.centre
         return rigid.compose(self.motion[:, None], rigid.make(local[..., :3], shift))
 
-    def from_world(self, transforms: np.ndarray) -> np.ndarray:
-        """The inverse of :meth:`to_world`: (F, B, 3, 4) -> (B, 4, 3, F)."""
-        local = rigid.compose(rigid.inverse(self.motion)[:, None], np.asarray(transforms, np.float64))
-        local[..., 3] += local[..., :3] @ self.centre - self.centre
-        local[..., 3] /= self.scale
-        local[..., :3] -= np.eye(3)
-        return np.ascontiguousarray(np.moveaxis(local, (0, 1, 2, 3), (3, 0, 2, 1)))
-
 
 @dataclass(frozen=True)
 class Trajectories:

@@ -20,9 +20,9 @@ def case() -> tuple[Trajectories, np.ndarray, np.ndarray]:
     canonical = rng.standard_normal((40, 3))
     points = canonical + 0.3 * rng.standard_normal((6, 40, 3))
     paths = compress(points.astype(np.float32), canonical, tolerance=0.0, sample=np.arange(40))
-    turn = rotations.from_rotation_vector(0.3 * rng.standard_normal((6, 5, 3)))
-    world = rigid.make(turn, 0.3 * rng.standard_normal((6, 5, 3)))
-    return paths, paths.alignment.from_world(world), paths.path.astype(np.float64) @ paths.basis.T
+    turn = rotations.from_rotation_vector(0.3 * rng.standard_normal((6, 5, 3))) - np.eye(3)
+    local = rigid.make(turn, 0.3 * rng.standard_normal((6, 5, 3)))  # beside the identity, as offsets are
+    return paths, np.ascontiguousarray(local.transpose(1, 3, 2, 0)), paths.path.astype(np.float64) @ paths.basis.T
 
 
 def moved(paths: Trajectories, offsets: np.ndarray) -> np.ndarray:
@@ -37,10 +37,16 @@ def best_weights(a: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, float]:
     return w / w.sum(), float(np.sum((w / w.sum() @ a - x) ** 2))
 
 
-def test_world_and_offsets_are_inverse(case: tuple[Trajectories, np.ndarray, np.ndarray]) -> None:
+def test_offsets_in_the_world_move_points_as_their_paths_say(case: tuple[Trajectories, np.ndarray, np.ndarray]) -> None:
+    """x = R_f (scale h + centre + scale D h) + t_f, point by point."""
     paths, offsets, _ = case
-    world = paths.alignment.to_world(offsets)
-    np.testing.assert_allclose(paths.alignment.from_world(world), offsets, atol=1e-12)
+    along, rest = paths.alignment, paths.rest[:, :3]
+    world = along.to_world(offsets)
+    canonical = along.scale * rest + along.centre
+    for f, b in ((0, 0), (3, 1), (5, 4)):
+        local = along.scale * (rest + paths.rest @ offsets[b, :, :, f]) + along.centre
+        expected = local @ along.motion[f, :, :3].T + along.motion[f, :, 3]
+        np.testing.assert_allclose(canonical @ world[f, b, :, :3].T + world[f, b, :, 3], expected, atol=1e-12)
 
 
 def test_weights_on_a_given_support(case: tuple[Trajectories, np.ndarray, np.ndarray]) -> None:

@@ -1,4 +1,4 @@
-"""Where Gaussians are: transparent ones move to where the images pull hardest, and their number grows."""
+"""Where Gaussians are: transparent ones move to where the images pull hardest, their number grows, hidden ones go."""
 
 from __future__ import annotations
 
@@ -61,6 +61,14 @@ def divide(
         for name in NAMES:
             adam.forget(name, both)
     return wanted
+
+
+def keep(params: dict[str, torch.Tensor], adam: Adam, rows: np.ndarray) -> None:
+    """Leaves only some Gaussians, with their moments. rows: rising numbers."""
+    for name in NAMES:
+        params[name] = params[name].detach()[rows].clone().requires_grad_()
+        for moments in (m for m in (adam.first, adam.second) if name in m):
+            moments[name] = moments[name][rows].clone()
 
 
 def _append(params: dict[str, torch.Tensor], adam: Adam, name: str, rows: np.ndarray) -> None:

@@ -31,6 +31,7 @@ def fit(
     growth: float,
     divide_every: int,
     divide_until: float,
+    least_shown: float,
     sh_degree: int,
     structure: float,
     cover: float,
@@ -68,7 +69,9 @@ def fit(
     side; or a ``ball``.
     Curriculum: see :class:`Schedule` for static, grown, coarsest, full (shares).
     Density: ``gaussians`` at the start; every divide_every steps, up to the share divide_until of the iterations, those
-    that are pulled hardest are divided, and the number grows by the share ``growth`` up to max_gaussians.
+    that are pulled hardest are divided, and the number grows by the share ``growth`` up to max_gaussians. In place of
+    the last division hidden ones go: those of which the training images show less than the share least_shown of what
+    they show of the mean Gaussian (:mod:`visibility`); 0 leaves all.
     sh_degree: 0 to 3. structure, cover: weights of 1 - SSIM (GA eq. 2) and of the alpha's error.
     Rigidity (GA eq. 3 and 4): over ``neighbours`` of ``carriers`` (the nodes; or points spread over the thing, moved by
     the network). ``own``: each carrier's own rotation, ``svd``: the one that fits best; weights for ARAP and for kept
@@ -96,12 +99,11 @@ def _check(recipe: dict) -> None:
     shares = ("hull_agree", "static", "grown", "full", "divide_until", "structure", "averaged", "rigidity_end")
     rules += [(n, 0.0 <= recipe[n] <= 1.0, "a share, 0 to 1") for n in shares]
     rates = [n for n in recipe if n.startswith("rate_")]
+    weights = ("cover", "arap_weight", "distance_weight", "smooth_weight")
     rules += [
         (n, recipe[n] > 0, "a positive number") for n in (*rates, "coarsest", "images_per_knot", "frames_per_knot")
     ]
-    rules += [
-        (n, recipe[n] >= 0, "0 or more") for n in ("cover", "arap_weight", "distance_weight", "smooth_weight", "growth")
-    ]
+    rules += [(n, recipe[n] >= 0, "0 or more") for n in (*weights, "growth", "least_shown")]
     rules += [
         ("sh_degree", 0 <= recipe["sh_degree"] <= 3, "0, 1, 2 or 3"),
         ("coarsest", recipe["coarsest"] <= 1, "at most 1"),

@@ -14,6 +14,7 @@ from tasks.errors import InputError
 from tasks.reconstruction import checkpoint, cuts, density
 from tasks.reconstruction.adam import Adam
 from tasks.reconstruction.curriculum import Schedule, Window
+from tasks.reconstruction.deformed import Deformed
 from tasks.reconstruction.hull import Start, ball_start, hull_start
 from tasks.reconstruction.losses import photometric
 from tasks.reconstruction.mlp import Mlp
@@ -21,6 +22,7 @@ from tasks.reconstruction.nodes import Nodes
 from tasks.reconstruction.rasterize import rasterize
 from tasks.reconstruction.rigidity import Neighbourhood
 from tasks.reconstruction.splines import Spline, spline
+from tasks.reconstruction.visibility import shown
 from tasks.values import Capture, Gaussians, Reconstruction
 from tasks.workspace import Workspace
 
@@ -139,20 +141,15 @@ class Fitting:
 
     def _loss(self, view: cuts.View, frame: int) -> tuple[dict[str, torch.Tensor], torch.Tensor, torch.Tensor]:
         recipe, params = self.recipe, self.params
-        means, scales, opacities, terms = params["means"], params["log_scales"], params["opacities"], {}
-        if self.deformation is not None:
-            moved = self.deformation.at(frame, means)
-            means = moved.means
-            scales = scales if moved.log_scales is None else scales + moved.log_scales
-            opacities = opacities if moved.opacities is None else opacities + moved.opacities
-            terms = self._rigidity(moved) | self._roughness()
+        (means, scales, opacities), moved = self._drawn(frame)
+        terms = {} if moved is None else self._rigidity(moved) | self._roughness()
         if means is not params["means"]:
             means.retain_grad()
         background = self._background()
         colour, alpha, _ = rasterize(
             means,
-            torch.exp(scales),
-            torch.sigmoid(opacities),
+            scales,
+            opacities,
             params["sh"],
             view.view,
             view.intrinsics,
@@ -163,7 +160,17 @@ class Fitting:
         seen, squared = photometric(colour, alpha, view, background, structure=recipe.structure, cover=recipe.cover)
         return seen | terms, squared, means
 
-    def _rigidity(self, moved) -> dict[str, torch.Tensor]:
+    def _drawn(self, frame: int) -> tuple[tuple[torch.Tensor, torch.Tensor, torch.Tensor], Deformed | None]:
+        """Means, scales and opacities in a frame, and what the deformation says."""
+        means, scales, opacities = (self.params[n] for n in ("means", "log_scales", "opacities"))
+        moved = None if self.deformation is None else self.deformation.at(frame, means)
+        if moved is not None:
+            means = moved.means
+            scales = scales if moved.log_scales is None else scales + moved.log_scales
+            opacities = opacities if moved.opacities is None else opacities + moved.opacities
+        return (means, torch.exp(scales), torch.sigmoid(opacities)), moved
+
+    def _rigidity(self, moved: Deformed) -> dict[str, torch.Tensor]:
         recipe = self.recipe
         if recipe.arap == "off":
             return {}
@@ -257,7 +264,10 @@ class Fitting:
     def _after(self) -> None:
         recipe, along = self.recipe, self.iteration / self.recipe.iterations
         if self.iteration % recipe.divide_every == 0:
-            if along <= recipe.divide_until:
+            last = self.iteration + recipe.divide_every > recipe.divide_until * recipe.iterations
+            if along <= recipe.divide_until and last and recipe.least_shown > 0:
+                self._remove_hidden()
+            elif along <= recipe.divide_until:
                 density.divide(self.params, self.adam, self.pull, recipe.max_gaussians, recipe.growth, self.rng)
             self.pull = density.Pull(len(self.params["means"]))
             self._bind()
@@ -268,6 +278,12 @@ class Fitting:
                 mean += (value.detach() - mean) / self.averaged
         if self.iteration % REPORT == 0 or self.iteration == recipe.iterations:
             self._report()
+
+    def _remove_hidden(self) -> None:
+        """Takes out what the training images show least of; the steps that are left close what opens."""
+        drawn = ((self._views[i], self._drawn(int(f))[0]) for i, f in enumerate(self.capture.frame))
+        area = shown(drawn, self.recipe.backend)
+        density.keep(self.params, self.adam, np.flatnonzero(area >= self.recipe.least_shown * area.mean()))
 
     def _report(self) -> None:
         steps = self.iteration - (int(self.history[-1][0]) if self.history else 0)

@@ -11,16 +11,17 @@ import torch
 import yaml
 
 from tasks.errors import InputError
-from tasks.reconstruction import adam, density, fitting
+from tasks.reconstruction import adam, cuts, density, fitting
 from tasks.reconstruction.curriculum import Schedule, Window
 from tasks.reconstruction.fit import fit
 from tasks.reconstruction.hull import hull_start, nearest_views, whereabouts
 from tasks.reconstruction.motion import motion_of
 from tasks.reconstruction.nodes import Nodes
-from tasks.reconstruction.rasterize import rasterize
+from tasks.reconstruction.rasterize import EPS2D, rasterize
 from tasks.reconstruction.rigidity import Neighbourhood, best_rotations, rotation_of
 from tasks.reconstruction.skin import Skin, skin_reference
 from tasks.reconstruction.splines import spline
+from tasks.reconstruction.visibility import shown
 from tasks.values import Capture, same
 from tasks.workspace import Workspace
 
@@ -255,6 +256,31 @@ def test_division_reuses_transparent_gaussians_then_grows():
     assert int((params["log_scales"] < 0).sum()) == 10  # both halves are smaller
 
 
+def test_gaussians_show_what_nothing_nearer_covers():
+    """A small half transparent one, a large opaque one and one behind it: areas in closed form, 2 pi variance."""
+    lens = torch.tensor([[50.0, 0, 20], [0, 50, 20], [0, 0, 1]])
+    view = cuts.View(torch.eye(4), lens, torch.zeros(40, 40, 3), None, 1600)
+    means = torch.tensor([[0.5, 0.5, 2.0], [0, 0, 3.0], [0, 0, 5.0]])
+    scales, opacities = torch.tensor([[0.04], [0.2], [0.05]]), torch.tensor([0.5, 0.999, 0.999])
+    once = shown([(view, (means, scales, opacities))], "numba")
+    small, large = (50 * 0.04 / 2) ** 2 + EPS2D, (50 * 0.2 / 3) ** 2 + EPS2D  # pixels^2
+    np.testing.assert_allclose(once[0] / once[1], 0.5 * small / (0.999 * large), rtol=0.08)
+    assert 0 < once[2] < 0.01 * once[1]
+    np.testing.assert_allclose(shown(2 * [(view, (means, scales, opacities))], "numba"), 2 * once)
+
+
+def test_only_some_gaussians_are_left_with_their_moments():
+    params = {n: torch.arange(5.0).view(5, 1) for n in density.NAMES}
+    own = adam.Adam()
+    own.first, own.second = ({n: m * torch.arange(5.0).view(5, 1) for n in density.NAMES} for m in (2, 3))
+    density.keep(params, own, np.array([1, 4]))
+    for name in density.NAMES:
+        assert params[name][:, 0].tolist() == [1, 4]
+        assert params[name].requires_grad
+        assert own.first[name][:, 0].tolist() == [2, 8]
+        assert own.second[name][:, 0].tolist() == [3, 12]
+
+
 # a whole fit
 
 
@@ -272,6 +298,20 @@ def test_planted_ball_is_found_again(tmp_path):
     motion = motion_of(found)
     assert motion.points is found.points
     assert motion.faces is None
+
+
+def test_hidden_gaussians_are_taken_out_at_the_end_of_division(tmp_path):
+    """A filled ball's inside is seen by nobody: with the rule nearly all Gaussians are left near its skin."""
+    capture, points = planted()
+    centre = points.mean(1)
+    inside = {}
+    for share in (0.0, 0.2):
+        given = settings(iterations=120, start="ball", gaussians=800, max_gaussians=800, least_shown=share)
+        found = fit(capture, **given, workspace=Workspace(tmp_path / str(share)))
+        far = np.linalg.norm(found.points[0] - centre[0], axis=1)
+        inside[share] = (far < 0.3).sum(), len(far)
+    assert inside[0.2][1] < inside[0.0][1]
+    assert inside[0.2][0] < 0.5 * inside[0.0][0]
 
 
 @pytest.mark.parametrize("preset", ["cpu", "paper"])

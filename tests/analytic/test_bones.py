@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tasks.bones import weights
 from tasks.bones.clustering import choose_count, cluster
 from tasks.bones.refit import refit_bones
 from tasks.bones.rigid import rigid_skinning
@@ -110,6 +111,24 @@ def test_transforms_are_rigid_and_weights_are_a_partition() -> None:
     assert skinning.history[-1] == pytest.approx(
         vertex_rmse(skin(points, skinning.weights, skinning.transforms), moved)
     )
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.03])
+def test_the_pull_to_near_bones_is_the_clusters_own_squared_error_over_the_frames(noise: float, monkeypatch) -> None:
+    """Three times the noise is nine times the pull: it is held against squared errors."""
+    rng = np.random.default_rng(4)
+    points, labels = boxes(rng, 3)
+    moved = rigid.apply(random_transforms(rng, 20, 3)[:, labels], points)
+    motion = motion_of(moved + noise * rng.standard_normal(moved.shape))
+    clusters = cluster(motion, canonical_of(points), **CLUSTERING)
+    pulls, exchange = set(), weights.exchange
+    monkeypatch.setattr(weights, "exchange", lambda *a, **how: pulls.add(how["locality"]) or exchange(*a, **how))
+    ssdr(motion, canonical_of(points), clusters, **SSDR | {"iterations": 2, "locality": 0.5})
+    own = np.eye(clusters.transforms.shape[1], dtype=np.float32)[clusters.labels]
+    error = vertex_rmse(skin(canonical_of(points).points, own, clusters.transforms), motion.points)
+    radius = np.sqrt(((points - points.mean(0)) ** 2).sum(1).mean())
+    assert len(pulls) == 1
+    assert pulls.pop() == pytest.approx(0.5 * (error / radius) ** 2 / 20, rel=0.01)
 
 
 def test_refit_on_unseen_frames_finds_their_transforms() -> None:

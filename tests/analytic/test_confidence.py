@@ -8,6 +8,7 @@ import pytest
 from tasks.errors import InputError
 from tasks.evaluation.confidence import confidence_file, confidence_picture, evaluate_confidence
 from tasks.methods import partmm
+from tasks.motion import confidence as module
 from tasks.motion.confidence import confidence
 from tasks.values import Animation, Poses
 from tests.analytic import planted
@@ -66,6 +67,21 @@ def test_its_rank_correlation_is_reported_and_files_name_the_sources(train):
     clip, frame = first["source_1"].split(":")
     assert 60 * int(clip.removeprefix("clip")) + int(frame) == found.windows[0, 0, 0]
     assert "expected" in confidence_picture(found, {"mine": Animation(off)}, test).svg
+
+
+def test_where_near_matches_were_worse_than_far_ones_distance_is_no_warning(train, monkeypatch):
+    """An error that falls with the distance would promise that the wildest pose is met best."""
+
+    def backwards(training, known, windows):
+        clips = range(len(known.poses.clip_start) - 1)
+        apart = [module._look(known, known.poses, c, SETTINGS["k"], SETTINGS["patch"], 0.0, c)[1] for c in clips]
+        return 0.01 / np.concatenate(apart).mean((1, 2))
+
+    query = planted.poses([planted.gesture(30, 9, 0.4), planted.gesture(30, 9, 2.0)])
+    monkeypatch.setattr(module, "_errors", backwards)
+    expected = confidence(train, query, **SETTINGS).expected
+    assert np.ptp(expected) == 0
+    assert expected[0] > 0
 
 
 def test_one_clip_leaves_nothing_to_judge_by(train):

@@ -14,6 +14,7 @@ from tasks.geometry.rotations import from_rotation_vector
 from tasks.geometry.skinning import skin
 from tasks.methods import lbs, partmm
 from tasks.motion.database import build_database
+from tasks.motion.parts import find_parts
 from tasks.values import Poses
 from tests.analytic import planted
 
@@ -181,6 +182,40 @@ def test_a_skeleton_of_one_joint_follows_its_root(train):
     query = Poses(B[:20, :1], np.zeros((20, 1, 3), np.float32), np.array([0, 20]))
     made = partmm.animate(single, query, **PAPER)
     np.testing.assert_allclose(made.points, lbs.animate(single, query).points, atol=1e-5)
+
+
+def under_a_turning_node(pose: Poses, pelvis: np.ndarray, seed: int) -> Poses:
+    """The same poses in the world of a body that hangs on a node at the origin, which turns for itself."""
+    node = from_rotation_vector(np.cumsum(np.random.default_rng(seed).normal(0, 0.2, (len(pose.rotations), 1, 3)), 0))
+    back = np.swapaxes(node, -1, -2)
+    hips = back @ pose.rotations[:, :1]
+    moved = (back @ (pelvis + pose.translations[:, :1])[..., None])[..., 0] - pelvis
+    rotations = np.concatenate([node, hips, pose.rotations[:, 1:]], axis=1).astype(np.float32)
+    translations = np.concatenate([np.zeros_like(moved), moved, pose.translations[:, 1:]], axis=1).astype(np.float32)
+    return Poses(rotations, translations, pose.clip_start)
+
+
+@pytest.mark.parametrize("way", [PAPER, PAPER | {"represent": "part"}])
+def test_a_node_above_the_body_plays_no_part(train, way):
+    """Rigs hang bodies on a node that carries them through the world: how it turns is not the body's pose."""
+    tree, count = train.skeleton, len(train.skinning.rest)
+    hung = replace(
+        tree,
+        names=("node", *tree.names),
+        parents=np.append(-1, tree.parents + 1),
+        joints=np.concatenate([np.zeros((1, 3)), tree.joints]).astype(np.float32),
+        weights=np.concatenate([np.zeros((count, 1)), tree.weights], axis=1).astype(np.float32),
+    )
+    known = under_a_turning_node(train.database.poses, tree.joints[0], 1)
+    below = replace(
+        train,
+        skeleton=hung,
+        parts=find_parts(hung, train.skinning, kind="auto", named=[], overlap=1, affinity=0.15),
+        database=build_database(train.motion, train.skinning, known),
+    )
+    query = planted.poses([planted.gesture(30, 9)])
+    made = partmm.animate(below, under_a_turning_node(query, tree.joints[0], 2), **way)
+    np.testing.assert_allclose(made.points, partmm.animate(train, query, **way).points, atol=2e-4)
 
 
 def test_lbs_is_forward_kinematics_and_skinning(train):

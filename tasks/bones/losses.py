@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from tasks.bones.products import FAST
 from tasks.bones.simplex import solve
 from tasks.bones.simplex import value as value_of
 from tasks.bones.trajectories import Trajectories
@@ -28,7 +27,7 @@ def losses(paths: Trajectories, bones: Forms, index: np.ndarray, value: np.ndarr
     return np.bincount(np.maximum(index, 0).ravel(), loss.ravel(), minlength=len(bones.square))
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def _losses(rest, path, length, frames, linear, square, index, value, loss, start, stop):
     count, slots = len(square), index.shape[1]
     raw, correlation = np.empty((TILE, 4 * count)), np.empty((TILE, count))
@@ -75,7 +74,7 @@ def _losses(rest, path, length, frames, linear, square, index, value, loss, star
                 loss[n, out] = max(now - whole, 0.0)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def _best_alone(diagonal, hh, c, e, banned):
     best, least = 0, np.inf
     for b in range(diagonal.shape[1]):

@@ -11,8 +11,6 @@ from numba import njit
 
 from tasks.geometry.parallel import for_chunks
 
-FAST = {"contract", "reassoc", "nsz"}  # lets sums be vectorised; NaN and infinity keep their meaning
-
 
 def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """a @ b in float64. a: (M, K), b: (K, L) -> (M, L)."""
@@ -22,7 +20,7 @@ def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return out
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def add_product(a, b, out, start, stop):
     """out[start:stop] += a[start:stop] @ b, four terms at a time so that a row of out is touched less often."""
     terms, columns = b.shape
@@ -37,7 +35,7 @@ def add_product(a, b, out, start, stop):
                 out[i, j] += a[i, k] * b[k, j]
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def orthonormalise(columns, basis, count):
     """Gram-Schmidt, twice, in place. columns: (L, K) rows of vectors to be made orthonormal to each other and to
     basis[:count]; a vector that holds nothing new becomes zero."""

@@ -6,7 +6,6 @@ import numpy as np
 from numba import njit
 
 from tasks.bones import transforms
-from tasks.bones.products import FAST
 from tasks.bones.trajectories import Alignment, align
 from tasks.geometry import rigid
 from tasks.geometry.parallel import for_chunks
@@ -108,7 +107,7 @@ def _raw_sums(
     return k, y, sum(for_chunks(work, len(points), _FRAMES))
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def _add_frames(points, rest, back, index, value, y, start, stop):
     count, slots = len(y), index.shape[1]
     sums = np.empty((count, 4, 3))

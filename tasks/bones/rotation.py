@@ -5,10 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from tasks.bones.products import FAST
 
-
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def nearest_rotation(m, r):
     """The rotation r that maximises tr(r^T m), through the largest eigenvalue of Horn's quaternion matrix.
 
@@ -49,7 +47,7 @@ def _set_identity(r):
             r[i, j] = 1.0 if i == j else 0.0
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def _horn(m, unit, q):
     """Horn's symmetric 4x4 matrix of unit * m."""
     a, b, c = m[0, 0] * unit, m[0, 1] * unit, m[0, 2] * unit
@@ -64,7 +62,7 @@ def _horn(m, unit, q):
     q[2, 3] = q[3, 2] = f + h
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def _largest_root(m, unit, q):
     """Largest root of x^4 - 2 x^2 - 8 det(m) x + det(q), m scaled to Frobenius norm one, so 1 <= x <= sqrt(3)."""
     det = m[0, 0] * (m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1])
@@ -97,7 +95,7 @@ def _largest_root(m, unit, q):
     return x
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def _cofactor(q, top, row, column):
     """Signed minor of q - top I without the given row and column."""
     r0, r1, r2 = (0 if row > 0 else 1), (1 if row > 1 else 2), (2 if row > 2 else 3)
@@ -115,7 +113,7 @@ def _cofactor(q, top, row, column):
     return minor if (row + column) % 2 == 0 else -minor
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def _rotation_of(q, r):
     """Rotation of a quaternion w x y z of any length."""
     s = 2.0 / (q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
@@ -125,7 +123,7 @@ def _rotation_of(q, r):
     r[2, 0], r[2, 1], r[2, 2] = s * (x * z - w * y), s * (y * z + w * x), 1.0 - s * (x * x + y * y)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def _jacobi(q, vectors):
     """Cyclic Jacobi on the symmetric 4x4 q (destroyed): vectors[0] becomes the eigenvector of the largest value."""
     for i in range(4):

@@ -5,12 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from tasks.bones.products import FAST
-
 _RIDGE = 1e-9  # relative to the mean diagonal: keeps the solve of two bones that move alike from dividing by zero
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def value(q, w, size):
     total = 0.0
     for s in range(size):
@@ -19,7 +17,7 @@ def value(q, w, size):
     return total
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def solve(q, bones, w, size):
     """Minimises w^T Q w over the simplex from a feasible w, dropping bones whose weight reaches zero.
 
@@ -52,7 +50,7 @@ def solve(q, bones, w, size):
     return size
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def _interior(q, goal, matrix, size):
     """goal[:size] minimises w^T Q w with sum w = 1 only: Cholesky on differences from bone 0, the heaviest."""
     n = size - 1

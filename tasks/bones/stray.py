@@ -6,7 +6,6 @@ import numpy as np
 from numba import njit
 from scipy.spatial import cKDTree
 
-from tasks.bones.products import FAST
 from tasks.geometry.neighbours import mesh_edges
 from tasks.geometry.parallel import for_chunks
 
@@ -50,7 +49,7 @@ def trusted(points: np.ndarray, canonical: np.ndarray, faces: np.ndarray | None)
     return (own <= _TIMES * around) | (own <= _LEAST * np.linalg.norm(high - low))
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def _unsteadiness(points, rest, index, near, change, start, stop):
     """change[i, k]: root mean square, over frames, of the change of the distance from index[i] to near[i, k]."""
     for i in range(start, stop):

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from numba import njit
 
-from tasks.bones.products import FAST, orthonormalise, product
+from tasks.bones.products import orthonormalise, product
 from tasks.geometry import rigid
 from tasks.geometry.parallel import for_chunks
 
@@ -143,7 +143,7 @@ def project(points: np.ndarray, rest: np.ndarray, basis: np.ndarray, frame: Alig
     return Trajectories(rest, path, basis, energy, frame)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def _project(points, rest, back, basis, path, start, stop):
     width = basis.shape[2]
     sums = np.zeros((_TILE, width))

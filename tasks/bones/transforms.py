@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from tasks.bones.products import FAST, product
+from tasks.bones.products import product
 from tasks.bones.rotation import nearest_rotation
 from tasks.bones.trajectories import Trajectories
 from tasks.geometry.parallel import for_chunks
@@ -68,7 +68,7 @@ def rigid_fit(k: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return offsets, gain
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def add_moments(rest, index, value, k):
     """k (B, B, 4, 4) += K of the given points."""
     slots = index.shape[1]
@@ -88,7 +88,7 @@ def add_moments(rest, index, value, k):
                         k[b, c, i, j] += both * h[i] * h[j]
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def _add_sums(rest, path, index, value, k, y, start, stop):
     add_moments(rest[start:stop], index[start:stop], value[start:stop], k)
     for n in range(start, stop):
@@ -102,7 +102,7 @@ def _add_sums(rest, path, index, value, k, y, start, stop):
                     y[b, i, p] += factor * path[n, p]
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def _target(k, y, offsets, b, start, stop, skip, out):
     """out (4, 3, stop - start) = Y_b - sum_c K_bc D_c, without c = b if skip."""
     for i in range(4):
@@ -124,7 +124,7 @@ def _target(k, y, offsets, b, start, stop, skip, out):
                 o3[f] -= m[3, 0] * x0 + m[3, 1] * x1 + m[3, 2] * x2 + m[3, 3] * x3
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def _sweep(k, y, offsets, start, stop, sweeps):
     target = np.empty((4, 3, stop - start))
     for _ in range(sweeps):
@@ -142,7 +142,7 @@ def _sweep(k, y, offsets, start, stop, sweeps):
     return change
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def _procrustes(k, target, offset, start, stop):
     """Weighted Procrustes of one bone: k (4, 4), target (4, 3, frames) -> offset (4, 3, F) in place.
 
@@ -172,7 +172,7 @@ def _procrustes(k, target, offset, start, stop):
             offset[3, d, f] = shift / total
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def _rigid_fit(k, y, offsets, gain, start, stop):
     frames = y.shape[3]
     for b in range(start, stop):
@@ -188,7 +188,7 @@ def _rigid_fit(k, y, offsets, gain, start, stop):
                     gain[b] += offsets[b, i, d, f] * (moved - 2.0 * y[b, i, d, f])
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def _make_rotations(offsets, fallback, start, stop):
     m, r = np.empty((3, 3)), np.empty((3, 3))
     for b in range(len(offsets)):

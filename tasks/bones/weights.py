@@ -16,7 +16,7 @@ import numpy as np
 from numba import njit
 
 from tasks.bones.graph import Graph, alone
-from tasks.bones.products import FAST, product
+from tasks.bones.products import product
 from tasks.bones.simplex import solve
 from tasks.bones.simplex import value as value_of
 from tasks.bones.trajectories import Trajectories
@@ -128,7 +128,7 @@ def exchange(
     return error
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def correlate(rest, path, linear, low, high, raw, correlation):
     """correlation[n - low, b] = <D_b h_n, u_n>, mean over frames, for the points low..high and all bones."""
     columns = linear.shape[1]
@@ -152,7 +152,7 @@ def correlate(rest, path, linear, low, high, raw, correlation):
             correlation[n - low, b] = h0 * row[b] + h1 * row[count + b] + h2 * row[2 * count + b] + row[3 * count + b]
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def _correlate_few(h, path, rows, bones, correlation):
     """correlation[b] = <D_b h, u> of one point for the given bones; zero for all others."""
     correlation[:] = 0.0
@@ -166,7 +166,7 @@ def _correlate_few(h, path, rows, bones, correlation):
         correlation[b] = total
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def products_of(h, out):
     """The ten different entries of h h^T."""
     k = 0
@@ -176,7 +176,7 @@ def products_of(h, out):
             k += 1
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def _nearest_bone(rest, path, length, frames, linear, own, label, error, start, stop):
     count = own.shape[1]
     raw, correlation, hh = np.empty((TILE, 4 * count)), np.empty((TILE, count)), np.empty(10)
@@ -195,7 +195,7 @@ def _nearest_bone(rest, path, length, frames, linear, own, label, error, start, 
             label[n], error[n] = best, max(least, 0.0)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def _exchange(
     rest,
     path,
@@ -261,7 +261,7 @@ def _exchange(
                 index[n, s], value[n, s] = (bones[s], w[s]) if s < size else (-1, 0.0)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def _pull(n, graph, last, smoothness, c):
     """|w - m|^2 = |w|^2 - 2 <w, m> + ...: since sum w = 1 the mean m of the neighbours just adds to c."""
     indptr, indices, shares = graph
@@ -273,7 +273,7 @@ def _pull(n, graph, last, smoothness, c):
                 c[old_index[other, s]] += smoothness * shares[a] * old_value[other, s]
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def quadratic_form(square, hh, c, e, smoothness, bones, size, q):
     """q[:size, :size] = Q among the given bones."""
     for s in range(size):
@@ -284,7 +284,7 @@ def quadratic_form(square, hh, c, e, smoothness, bones, size, q):
             q[s, r] = q[r, s] = total + (smoothness if s == r else 0.0)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def best_bone(square, diagonal, hh, c, e, smoothness, bones, w, size, now, reach, banned):
     """The bone outside the support, and not banned, towards which w^T Q w falls most along a line, or -1."""
     count = len(square)
@@ -317,7 +317,7 @@ def best_bone(square, diagonal, hh, c, e, smoothness, bones, w, size, now, reach
     return best
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def bring_in(square, hh, c, e, smoothness, bones, w, size, slots, now, q, found):
     """Adds a bone, solves, and if the support is too large drops the bone that costs least.
 

@@ -258,7 +258,7 @@ def blend_backward(
             m[0], m[1], m[2], m[3], m[4], m[5], m[6], m[7], m[8], m[9] = m0, m1, m2, m3, m4, m5, m6, m7, m8, m9
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, nogil=True, error_model="numpy")
 def pixel_slopes(i, j, p, background, images, slopes, pixels):
     """The loss's slopes by what a pixel sums up (colour, alpha, alpha times depth), and the sum of w u over it all."""
     real = pixels.dtype.type

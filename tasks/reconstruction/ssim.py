@@ -81,7 +81,7 @@ def products(first, last, x, y, fields):
             fields[4, i + HALF, k] = x[i, k] * y[i, k]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, nogil=True, error_model="numpy")
 def blur_row(field, i, taps, channels, line, out):
     """Row i of a field blurred down and across. line: (W D + 2 HALF D,), zero at its ends."""
     middle = line[HALF * channels : HALF * channels + len(out)]

@@ -91,7 +91,7 @@ class Store:
     """A folder of artefacts; safe for several processes at once."""
 
     def __init__(self, path: str | os.PathLike, *, create: bool = True) -> None:
-        self.path = Path(path)
+        self.path = Path(path).expanduser()
         if create:
             with explained(self.path):
                 self.path.mkdir(parents=True, exist_ok=True)

@@ -216,7 +216,8 @@ def _pass(graph: Graph, config: dict, progress: Progress, outcome: Outcome) -> N
                     outcome.refs[node.id] = cached
                     progress.done(node, cached)
                     continue
-                named = task.with_options(name=node.stage, task_run_name=f"{node.title}: {short(node.cases)}")
+                title = f"{node.title}: {short(node.cases)}".replace("{", "{{").replace("}", "}}")  # Prefect formats it
+                named = task.with_options(name=node.stage, task_run_name=title)
                 future = named.submit(job, wait_for=[futures[u.id] for u in node.upstream() if u.id in futures])
                 running[future] = node
                 futures[node.id] = future
@@ -280,6 +281,7 @@ def raise_first(graph: Graph, outcome: Outcome, pardoned: type[Exception] | tupl
 
 def job_of(node: Node, refs: dict[str, Ref], config: dict, events: str | None) -> Job:
     """The node's work, once the artefacts of its inputs are known."""
+    store = Store(config["store"]["path"], create=False).path.absolute()  # a worker may stand in another folder
 
     def resolve(value):
         if isinstance(value, dict):
@@ -297,7 +299,7 @@ def job_of(node: Node, refs: dict[str, Ref], config: dict, events: str | None) -
         source=node.source,
         files=node.files,
         case=short(node.cases),
-        store=str(Path(config["store"]["path"]).absolute()),  # a worker may stand in another folder
+        store=str(store),
         events=events,
         max_gb=config["memory"]["max_gb"],
     )

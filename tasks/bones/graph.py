@@ -28,7 +28,8 @@ def moving_together(points: np.ndarray, canonical: np.ndarray, faces: np.ndarray
     chosen = np.unique(np.linspace(0, len(points) - 1, _FRAMES).round().astype(int))
     for f in chosen:
         change += (_lengths(points[f], a, b) - rest) ** 2
-    stretch = np.sqrt(change / len(chosen)) / np.maximum(rest, 1e-3 * rest.mean() if len(rest) else 1.0)
+    shortest = max(1e-3 * rest.mean(), 1e-100) if len(rest) else 1.0  # neighbours may all lie in one place
+    stretch = np.sqrt(change / len(chosen)) / np.maximum(rest, shortest)
     strength = 1.0 / (1.0 + (stretch / _RIGID) ** 2)
     rows, columns = np.concatenate([a, b]), np.concatenate([b, a])
     order = np.lexsort((columns, rows))

@@ -35,6 +35,8 @@ def existing_path(path: str, *, expected: str) -> Path:
     if not found.exists():
         where = "no such file or folder" + ("" if found.parent.exists() else f" (and no folder {found.parent})")
         raise InputError(path, expected=expected, found=where, do="check dataset.path")
+    if not (found.is_file() or found.is_dir()):  # reading a pipe would wait for ever
+        raise InputError(path, expected=expected, found="neither a file nor a folder", do="check dataset.path")
     return found
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from tasks.errors import InputError
@@ -12,6 +14,7 @@ from tasks.motion.regression import shape_units, to_numbers
 from tasks.motion.search import nearest_windows
 from tasks.values import Confidence, Poses, Training
 
+LEAST = 5  # frames that a line is fitted to
 TINY = 1e-4  # radians and body units below which differences mean nothing
 
 
@@ -41,28 +44,38 @@ def confidence(training: Training, query: Poses, *, k: int, patch: int, dynamics
         np.concatenate, zip(*(look(query, c) for c in range(len(query.clip_start) - 1)), strict=True)
     )
     far = distance.mean((1, 2), dtype=np.float64)
-    if len(known.poses.clip_start) == 2:  # one clip tells nothing about others
-        nothing = np.zeros(len(far), np.float32)
-        return Confidence(windows, distance, nothing, nothing, training.parts.names)
-    clips = range(len(known.poses.clip_start) - 1)
-    others, apart = map(np.concatenate, zip(*(look(known.poses, c, c) for c in clips), strict=True))
-    seen = apart.mean((1, 2), dtype=np.float64)
-    outside = np.searchsorted(np.sort(seen), far) / len(seen)
-    slope, level = np.polyfit(np.log(seen + TINY), np.log(_errors(training, known, others) + TINY), 1)
-    expected = np.exp(level + max(slope, 0.0) * np.log(far + TINY))
+    expected, outside = _calibrated(training, known, far, patch, lambda clip: look(known.poses, clip, clip))
     return Confidence(windows, distance, expected.astype(np.float32), outside.astype(np.float32), training.parts.names)
 
 
-def _errors(training: Training, known: Posed, windows: np.ndarray) -> np.ndarray:
-    """Error of each training frame as the mean of its matches predicts it, about the RMSE of its points. windows:
-    (F, P, k) training frames -> (F,)."""
+def _calibrated(
+    training: Training, known: Posed, far: np.ndarray, patch: int, left_out: Callable[[int], tuple]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Expected errors and shares of nearer training frames for distances (F,); zeros where too few training frames have
+    a window of another clip beside them. left_out: a training clip matched against the others."""
+    start = known.poses.clip_start
+    long = np.diff(start) >= patch
+    judged = [c for c in range(len(long)) if np.delete(long, c).any()]
+    frames = np.concatenate([np.zeros(0, int), *(np.arange(start[c], start[c + 1]) for c in judged)])
+    if len(frames) < LEAST:
+        return np.zeros(len(far)), np.zeros(len(far))
+    others, apart = map(np.concatenate, zip(*map(left_out, judged), strict=True))
+    seen = apart.mean((1, 2), dtype=np.float64)
+    outside = np.searchsorted(np.sort(seen), far) / len(seen)
+    slope, level = np.polyfit(np.log(seen + TINY), np.log(_errors(training, known, others, frames) + TINY), 1)
+    return np.exp(level + max(slope, 0.0) * np.log(far + TINY)), outside
+
+
+def _errors(training: Training, known: Posed, windows: np.ndarray, frames: np.ndarray) -> np.ndarray:
+    """Error of some training frames as the mean of their matches predicts them, about the RMSE of their points.
+    windows: (F, P, k) training frames for each of the frames (F,) -> (F,)."""
     residual = to_numbers(known.encode(training.database.bones, "residual")) * shape_units(training)
-    predicted = np.zeros_like(residual)
+    predicted = np.zeros_like(residual[frames])
     for part, affinity in enumerate(training.parts.affinity):
         follows = np.flatnonzero(affinity > 0)
         for nearest in windows[:, part].T:
             predicted[:, follows] += affinity[follows, None] * residual[nearest][:, follows] / windows.shape[2]
-    return np.sqrt(((predicted - residual) ** 2).sum((1, 2)))
+    return np.sqrt(((predicted - residual[frames]) ** 2).sum((1, 2)))
 
 
 def _look(

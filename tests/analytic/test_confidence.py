@@ -69,10 +69,21 @@ def test_its_rank_correlation_is_reported_and_files_name_the_sources(train):
     assert "expected" in confidence_picture(found, {"mine": Animation(off)}, test).svg
 
 
+def test_clips_shorter_than_a_window_calibrate_nothing(train):
+    """Where all other clips are too short there is nothing to be matched with: the long clip is left aside."""
+    short = planted.training([CLIPS[0], CLIPS[1][:3], CLIPS[2][:2]])
+    query = planted.poses([planted.gesture(30, 9)])
+    found = confidence(short, query, **SETTINGS)
+    assert np.isfinite(found.expected).all()
+    assert found.expected.min() > 0  # the short clips were judged by the long one
+    for few in ([CLIPS[0]], [CLIPS[0], CLIPS[1][:1]]):
+        assert not confidence(planted.training(few), query, **SETTINGS).expected.any()
+
+
 def test_where_near_matches_were_worse_than_far_ones_distance_is_no_warning(train, monkeypatch):
     """An error that falls with the distance would promise that the wildest pose is met best."""
 
-    def backwards(training, known, windows):
+    def backwards(training, known, windows, frames):
         clips = range(len(known.poses.clip_start) - 1)
         apart = [module._look(known, known.poses, c, SETTINGS["k"], SETTINGS["patch"], 0.0, c)[1] for c in clips]
         return 0.01 / np.concatenate(apart).mean((1, 2))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import zipfile
 
 import numpy as np
@@ -123,6 +124,9 @@ def test_paths(tmp_path):
     rejects(lambda: load(tmp_path / "notes.txt"), "something else")
     (tmp_path / "one.obj").write_text("v 0 0 0")
     rejects(lambda: load(tmp_path / "one.obj"), "a single mesh")
+    if hasattr(os, "mkfifo"):
+        os.mkfifo(tmp_path / "pipe.npz")
+        rejects(lambda: load(tmp_path / "pipe.npz"), "neither a file nor a folder")
 
 
 def test_damaged_npz(tmp_path):

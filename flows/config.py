@@ -39,7 +39,7 @@ ADDED = ("experiment", "ablation")  # groups that the config does not choose fro
 ALONE = "again"  # the report of a case that is run again by itself
 SWEPT = ("datasets", "methods", "ablations")  # the axes of an experiment's grid
 SWEEP = dict.fromkeys(("experiments", *SWEPT), list[str] | None)
-SWEEP |= {"seeds": list[int] | None, "seeds_of": list[str] | None, "absent": Literal["fail", "skip"]}
+SWEEP |= {"seeds": list[schema.SEED] | None, "seeds_of": list[str] | None, "absent": Literal["fail", "skip"]}
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,6 @@ from tasks.errors import InputError
 
 def task_runner(settings: dict):
     """The task runner of a config's ``runner`` group. Raises InputError if its package is absent."""
-    workers = settings["workers"]
-    if workers < 1:
-        raise InputError("runner.workers", expected="at least 1", found=str(workers))
     return {"threads": _threads, "processes": _processes, "dask": _dask, "ray": _ray}[settings["kind"]](settings)
 
 

@@ -1,7 +1,8 @@
 """What every key of the config may hold.
 
 The settings of a stage are the keyword-only arguments of its function, read from the source (see ``flows.source``), so
-a type is written once, where it is used. What belongs to the run and not to a stage is declared here.
+a type, and the range of a number, are written once, where they are used, and checked before anything is computed. What
+belongs to the run and not to a stage is declared here.
 """
 
 from __future__ import annotations
@@ -10,8 +11,9 @@ import contextlib
 import difflib
 import types
 import typing
-from typing import Literal
+from typing import Annotated, Literal
 
+from flows.ranges import Interval
 from flows.source import choices, signature
 from tasks.errors import InputError, NotGiven
 
@@ -106,8 +108,9 @@ REPORT = {
     "curve": list[str] | None,
     "note": str,
 }
-LEFT_OUT = {"left_out": int, "left_out_of": list[str] | None}
-RUNNER = {"kind": Literal["threads", "processes", "dask", "ray"], "workers": int}
+LEFT_OUT = {"left_out": Annotated[int, "[0, inf)"], "left_out_of": list[str] | None}
+RUNNER = {"kind": Literal["threads", "processes", "dask", "ray"], "workers": Annotated[int, "[1, inf)"]}
+SEED = Annotated[int, "[0, inf)"]
 CLUSTERS = ("dask", "ray")  # runners that may use workers which run already
 FROM_RUN = {"seed"}  # arguments that come from the top of the config
 OF_STAGES = {
@@ -160,9 +163,9 @@ def schema(config: dict, sweep: dict[str, object]) -> dict[str, object]:
         bones["kind"] = Literal["ssdr"]
     bones |= settings(BONES.get(config["bones"].get("kind"), SSDR))
     return {
-        "seed": int,
+        "seed": SEED,
         "plan": bool | Literal["stages"],
-        "method_seed": int | None,
+        "method_seed": SEED | None,
         "confidence": settings(CONFIDENCE),
         "data_root": str,
         "pipeline": Literal[PIPELINES],
@@ -182,7 +185,7 @@ def schema(config: dict, sweep: dict[str, object]) -> dict[str, object]:
         **({"drive": settings(DRIVE)} if pipeline == "drive" else {}),
         "export": {"formats": list[Literal[tuple(EXPORTS)]]},
         "store": {"path": str},
-        "memory": {"max_gb": float | None},
+        "memory": {"max_gb": Annotated[float, "(0, inf)"] | None},
         "runner": RUNNER | ({"address": str | None} if config["runner"].get("kind") in CLUSTERS else {}),
         "sweep": sweep,
     }
@@ -288,15 +291,9 @@ def check(config: dict, expected: dict[str, object], where: str = "") -> dict:
 
 def check_run(config: dict) -> dict:
     """The config again. Raises InputError for values of the run itself that no stage checks."""
-    name, cap = config["report"]["name"], config["memory"]["max_gb"]
+    name = config["report"]["name"]
     if name in ("", ".", "..") or set(name) & set("/\\%&<>"):
         raise InputError("report.name", expected="the name of a folder", found=repr(name), do="set report.path instead")
-    if cap is not None and not cap > 0:
-        raise InputError("memory.max_gb", expected="a number above zero, or null", found=str(cap))
-    seeds = {"seed": [config["seed"]], "method_seed": [config["method_seed"]], "sweep.seeds": config["sweep"]["seeds"]}
-    for where, given in seeds.items():
-        if any(seed is not None and seed < 0 for seed in given or []):
-            raise InputError(where, expected="0 or more", found=str(min(s for s in given if s is not None)))
     return config
 
 
@@ -326,6 +323,10 @@ def _typed(value: object, kind: object, path: str) -> object:
                 return _typed(value, member, path)
         with contextlib.suppress(InputError) if others else contextlib.nullcontext():
             return _typed(value, last, path)
+    elif origin is Annotated:
+        plain = _typed(value, kind.__origin__, path)
+        if plain in Interval.of(kind.__metadata__[0]):
+            return plain
     elif origin is list:
         if isinstance(value, list):
             return [_typed(v, typing.get_args(kind)[0], f"{path}[{i}]") for i, v in enumerate(value)]
@@ -348,6 +349,8 @@ def describe(kind: object) -> str:
         return "one of " + ", ".join(str(a) for a in typing.get_args(kind))
     if typing.get_origin(kind) in UNIONS:
         return " or ".join("null" if m is type(None) else describe(m) for m in typing.get_args(kind))
+    if typing.get_origin(kind) is Annotated:
+        return f"{describe(kind.__origin__)}, {Interval.of(kind.__metadata__[0])}"
     if typing.get_origin(kind) is list:
         return f"a list, each entry {describe(typing.get_args(kind)[0])}"
     return {int: "a whole number", float: "a finite number", str: "text", bool: "true or false"}[kind]

@@ -6,7 +6,7 @@ import ast
 import hashlib
 from functools import cache
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from tasks.errors import InputError
 
@@ -22,6 +22,7 @@ _TYPES = {
     "list": list,
     "dict": dict,
     "Literal": Literal,
+    "Annotated": Annotated,
 }
 
 
@@ -96,7 +97,8 @@ def _tree(module: str) -> ast.Module:
 
 
 def _type(annotation: ast.expr | None) -> object:
-    """The type an annotation names: int, float, str, bool, list[...], Literal[...] and unions of them with None."""
+    """The type an annotation names: int, float, str, bool, list[...], Literal[...] and unions of them with None; a
+    number may have the interval it lies in, as ``Annotated[float, "(0, 1]"]`` (see :mod:`flows.ranges`)."""
     if annotation is None:
         raise TypeError("a setting without a type")
     code = compile(ast.Expression(annotation), "<annotation>", "eval")

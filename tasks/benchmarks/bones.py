@@ -6,13 +6,13 @@ A judge that stands above the stages: unlike a stage it may import several of th
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Annotated
 
 from tasks.benchmarks import dem_bones
 from tasks.benchmarks.cost import in_turn, measure, median, numbers, threads_held
 from tasks.bones.clustering import cluster
 from tasks.bones.refit import refit_bones
 from tasks.bones.ssdr import ssdr
-from tasks.errors import InputError
 from tasks.evaluation.metrics import declared
 from tasks.geometry.measure import diagonal, vertex_rmse
 from tasks.geometry.skinning import skin
@@ -37,12 +37,12 @@ def benchmark_bones(
     *,
     clustering: dict,
     decomposition: dict,
-    smooth: float | None,
-    affine: float | None,
-    repeats: int,
-    peer_repeats: int,
+    smooth: Annotated[float, "[0, inf)"] | None,
+    affine: Annotated[float, "[0, inf)"] | None,
+    repeats: Annotated[int, "[1, inf)"],
+    peer_repeats: Annotated[int, "[1, inf)"],
     held_out: bool,
-    threads: int,
+    threads: Annotated[int, "[0, inf)"],
 ) -> Metrics:
     """Our clusters and decomposition and the peer, in turn, on all frames of a motion; ratios are ours / the peer's.
 
@@ -51,11 +51,8 @@ def benchmark_bones(
     median is taken, after one of ours that compiles; threads: 0 for all cores.
     held_out: measure unseen frames too, those of ``test``, for which both run once more: bones are made from ``train``
     alone, weights frozen, transforms of both fitted to the unseen frames by the same solver. Raises InputError where
-    the extra is missing or a setting out of range.
+    the extra is missing.
     """
-    for name, found in (("repeats", repeats), ("peer_repeats", peer_repeats)):
-        if found < 1:
-            raise InputError(f"benchmark.{name}", expected="at least 1", found=str(found))
     peer = {"influences": decomposition["influences"], "smooth": smooth, "affine": affine}
     dem_bones.prepare(motion, canonical, bones=1, **peer)  # says now what it would miss later
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Callable
+from typing import Annotated
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -27,17 +28,23 @@ Work = Callable[[], object]
 
 
 def benchmark_rasterizer(
-    canonical: Canonical, *, gaussians: list[int], sizes: list[int], threads: list[int], repeats: int, seed: int
+    canonical: Canonical,
+    *,
+    gaussians: list[Annotated[int, "[4, inf)"]],
+    sizes: list[Annotated[int, "[8, inf)"]],
+    threads: list[Annotated[int, "[1, inf)"]],
+    repeats: Annotated[int, "[1, inf)"],
+    seed: int,
 ) -> Metrics:
     """Milliseconds to draw spheres that cover a shape, and for a step: drawing and the gradients of all they have.
 
     gaussians: their numbers; sizes: of the square image, in pixels; threads: for ours, while Warp has one on the
     processor; repeats: runs whose median is taken, ours and the peer's in turn, after one that only warms up. Every
     case is named by the three, as "step_ms@5000 at 128 px, 1 thread". Without a case's name: the largest ratio of all
-    cases with the fewest threads. Raises InputError where the extra is missing, the shape has no faces or a setting is
-    out of range.
+    cases with the fewest threads. Raises InputError where the extra is missing, the shape has no faces or
+    nothing is asked for.
     """
-    _check(canonical, {"gaussians": gaussians, "sizes": sizes, "threads": threads, "repeats": [repeats]})
+    _check(canonical, {"gaussians": gaussians, "sizes": sizes, "threads": threads})
     peer = _library()
     found: dict[str, float] = {}
     for count in gaussians:
@@ -145,7 +152,6 @@ def _worst(found: dict[str, float], case: str) -> dict[str, float]:
 def _check(canonical: Canonical, settings: dict[str, list[int]]) -> None:
     if canonical.faces is None:
         raise InputError("Canonical.faces", expected="triangles to lay Gaussians on", found="bare points")
-    least = {"gaussians": 4, "sizes": 8, "threads": 1, "repeats": 1}
     for name, values in settings.items():
-        if not values or min(values) < least[name]:
-            raise InputError(f"benchmark.{name}", expected=f"at least {least[name]}", found=str(values))
+        if not values:
+            raise InputError(f"benchmark.{name}", expected="at least one", found="none")

@@ -5,13 +5,14 @@ A judge that stands above the stages: unlike a stage it may import several of th
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import igl
 import numpy as np
 from scipy.spatial import cKDTree
 
 from tasks.benchmarks import cgal
 from tasks.benchmarks.cost import in_turn, numbers, threads_held
-from tasks.errors import InputError
 from tasks.evaluation.metrics import declared
 from tasks.geometry.neighbours import components
 from tasks.skeleton import graph
@@ -19,17 +20,17 @@ from tasks.skeleton.curve import curve_skeleton
 from tasks.values import Curve, Metrics, Surface
 
 
-def benchmark_skeleton(surface: Surface, *, tracing: dict, repeats: int, threads: int) -> Metrics:
+def benchmark_skeleton(
+    surface: Surface, *, tracing: dict, repeats: Annotated[int, "[1, inf)"], threads: Annotated[int, "[0, inf)"]
+) -> Metrics:
     """Both skeletons in turn; ratios are ours / the peer's.
 
     tracing: the settings of :func:`curve_skeleton`; repeats: runs whose median is taken, after one that only warms up;
     threads: 0 for all cores. Leaves have one edge, junctions three or more; inside is the share of nodes with a winding
     number above a half; mapped is the share of the surface's vertices that belong to exactly one node; limbs are
     the peer's leaves once its short branches are dropped by the rule that ours follow (``twig``). Raises
-    InputError where the extra is missing or a setting out of range.
+    InputError where the extra is missing.
     """
-    if repeats < 1:
-        raise InputError("benchmark.repeats", expected="at least 1", found=str(repeats))
     count = len(surface.vertices)
     peer = cgal.prepare(surface)
 

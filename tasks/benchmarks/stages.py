@@ -6,6 +6,7 @@ A judge that stands above the stages: unlike a stage it may import all of them.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Annotated
 
 from tasks.benchmarks.cost import Cost, in_use, measure, median, threads_held
 from tasks.benchmarks.scale import subdivided
@@ -36,18 +37,18 @@ def benchmark_stages(
     posing: dict,
     parting: dict,
     matching: dict,
-    subdivisions: int,
-    repeats: int,
-    threads: int,
+    subdivisions: Annotated[int, "[0, 5]"],
+    repeats: Annotated[int, "[1, inf)"],
+    threads: Annotated[int, "[0, inf)"],
 ) -> Metrics:
     """Seconds and memory of all stages from clusters to PartMM on the unseen clips, and of each.
 
     clustering, decomposition, closing, tracing, jointing, posing, parting, matching: the settings of the stages in
     their order; subdivisions: how often every triangle is cut in four first; repeats: runs whose median is taken, after
     one on the mesh as it comes, which compiles; threads: 0 for all cores. ``memory`` is the most that was in use on top
-    of what the process used before it had the fine mesh. Raises InputError for bare points or a setting out of range.
+    of what the process used before it had the fine mesh. Raises InputError for bare points.
     """
-    _check(train, subdivisions, repeats)
+    _check(train)
 
     def run(seen: Motion, unseen: Motion, shape: Canonical) -> dict[str, Cost]:
         costs: dict[str, Cost] = {}
@@ -101,12 +102,6 @@ def finer(motion: Motion, canonical: Canonical, subdivisions: int) -> tuple[Moti
     return motion, canonical
 
 
-def _check(train: Motion, subdivisions: int, repeats: int) -> None:
+def _check(train: Motion) -> None:
     if train.faces is None:
         raise InputError("Motion.faces", expected="triangles, which are made finer", found="bare points")
-    for name, found, good, expected in (
-        ("subdivisions", subdivisions, 0 <= subdivisions <= 5, "0 to 5"),
-        ("repeats", repeats, repeats >= 1, "at least 1"),
-    ):
-        if not good:
-            raise InputError(f"benchmark.{name}", expected=expected, found=str(found))

@@ -7,7 +7,7 @@ the count of clusters in one go, from which the count is chosen.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -16,7 +16,6 @@ from tasks.bones import transforms, weights
 from tasks.bones.refit import rigid_transforms
 from tasks.bones.stray import trusted
 from tasks.bones.trajectories import Trajectories, compress
-from tasks.errors import InputError
 from tasks.geometry.measure import diagonal
 from tasks.values import Canonical, Clusters, Motion
 
@@ -34,21 +33,19 @@ def cluster(
     train: Motion,
     canonical: Canonical,
     *,
-    max_bones: int,
+    max_bones: Annotated[int, "[1, inf)"],
     count: Literal["auto", "fixed"],
-    slack: float,
-    exact: float,
-    rounds: int,
+    slack: Annotated[float, "[0, inf)"],
+    exact: Annotated[float, "[0, inf)"],
+    rounds: Annotated[int, "[1, inf)"],
     seed: int,
 ) -> Clusters:
     """Rigid motion clusters of points.
 
     max_bones: ceiling; count: "fixed" takes as many as the points allow, "auto" the smallest count whose error is
     below `exact` (fraction of the canonical diagonal) or within `slack` (relative) of the error at the ceiling;
-    rounds: reassignments after every split. Raises InputError for settings out of range.
+    rounds: reassignments after every split.
     """
-    if max_bones < 1:
-        raise InputError("bones.max_bones", expected="at least 1", found=str(max_bones))
     rng = np.random.default_rng(seed)
     sound = trusted(train.points, canonical.points, canonical.faces)
     good = np.nonzero(sound)[0]

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Annotated
 
 import numpy as np
 
 from tasks.bones.refit import refit_bones
-from tasks.errors import InputError
 from tasks.geometry.measure import diagonal, vertex_rmse
 from tasks.geometry.skinning import skin
 from tasks.values import Canonical, Clusters, Motion, Skinning
@@ -16,18 +16,19 @@ THIN = 0.01  # of the diagonal: least half axis of an ellipsoid, so that a flat 
 
 
 def gaussian_bones(
-    train: Motion, canonical: Canonical, clusters: Clusters, *, sharpness: float, influences: int
+    train: Motion,
+    canonical: Canonical,
+    clusters: Clusters,
+    *,
+    sharpness: Annotated[float, "(0, inf)"],
+    influences: Annotated[int, "[1, inf)"],
 ) -> Skinning:
     """One Gaussian for every motion cluster; W = softmax of -sharpness/2 times the squared Mahalanobis distance.
 
     The weights (N, B) follow from where a point rests and not from how it moves, kept at the ``influences`` largest;
     the transforms (F, B, 3, 4) are then the best ones for these weights. Tan et al. 2025 (DressRecon), the paper's
-    SMPL+BoB in Table 4. Raises InputError for settings out of range.
+    SMPL+BoB in Table 4.
     """
-    if not sharpness > 0:
-        raise InputError("bones.sharpness", expected="a positive number", found=str(sharpness))
-    if influences < 1:
-        raise InputError("bones.influences", expected="1 or more", found=str(influences))
     distance = _mahalanobis(canonical.points, clusters.labels, clusters.transforms.shape[1])
     weights = _softmax(-0.5 * sharpness * distance, influences)
     start = Skinning(canonical.points.astype(np.float32), weights, clusters.transforms, np.zeros(0))

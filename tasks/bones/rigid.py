@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
 from scipy.sparse import diags
 
-from tasks.errors import InputError
 from tasks.geometry.measure import vertex_rmse
 from tasks.geometry.neighbours import adjacency, mesh_edges, nearest_edges
 from tasks.geometry.skinning import skin
@@ -15,11 +16,11 @@ INFLUENCES = 4  # most bones a point may have, as in the decomposition
 NEIGHBOURS = 8  # of a bare point
 
 
-def rigid_skinning(train: Motion, canonical: Canonical, clusters: Clusters, *, spread: int) -> Skinning:
+def rigid_skinning(
+    train: Motion, canonical: Canonical, clusters: Clusters, *, spread: Annotated[int, "[0, inf)"]
+) -> Skinning:
     """One bone for every cluster. Weights (N, B) are zeros and ones, or after ``spread`` > 0 rounds of averaging with
-    the neighbours' at most four shares a point. Raises InputError for a negative spread."""
-    if spread < 0:
-        raise InputError("bones.spread", expected="0 or more rounds", found=str(spread))
+    the neighbours' at most four shares a point."""
     weights = np.zeros((len(clusters.labels), clusters.transforms.shape[1]), np.float32)
     weights[np.arange(len(weights)), clusters.labels] = 1.0
     if spread:

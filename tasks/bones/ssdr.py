@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -42,14 +43,14 @@ def ssdr(
     canonical: Canonical,
     clusters: Clusters,
     *,
-    influences: int,
-    surplus: float,
-    iterations: int,
-    points_per_bone: int,
-    smoothness: float,
-    locality: float,
-    compression: float,
-    prune: float,
+    influences: Annotated[int, "[1, inf)"],
+    surplus: Annotated[float, "[1, inf)"],
+    iterations: Annotated[int, "[0, inf)"],
+    points_per_bone: Annotated[int, "[6, inf)"],
+    smoothness: Annotated[float, "[0, inf)"],
+    locality: Annotated[float, "[0, inf)"],
+    compression: Annotated[float, "(0, inf)"],
+    prune: Annotated[float, "[0, 1)"],
     seed: int,
 ) -> Skinning:
     """Weights W (N, B) and rigid transforms T (F, B, 3, 4) that minimise sum |sum_b w_nb T_fb v_n - x_fn|^2.
@@ -63,10 +64,11 @@ def ssdr(
     rounds. B is the number of clusters. Points that move like nothing around them get weights but do not move bones.
     Cost: linear in N and in F.
     history: vertex RMSE after every round, of the sample first, the last exactly that of the result.
-    Raises InputError for settings out of range. Source: Le & Deng, SIGGRAPH Asia 2012, eq. 2-8, solved as described in
-    the modules named above.
+    Raises InputError where prune could take all weights of a point. Source: Le & Deng, SIGGRAPH Asia 2012, eq. 2-8,
+    solved as described in the modules named above.
     """
-    _check(influences, surplus, iterations, points_per_bone, prune)
+    if not prune * influences < 1.0:
+        raise InputError("bones.prune", expected="below 1 / influences", found=str(prune))
     rng = np.random.default_rng(seed)
     sound = clusters.sound
     good = np.nonzero(sound)[0]
@@ -97,17 +99,6 @@ class _Bones:
     index: np.ndarray
     value: np.ndarray
     offsets: np.ndarray
-
-
-def _check(influences: int, surplus: float, iterations: int, points_per_bone: int, prune: float) -> None:
-    ranges = (("influences", influences, 1), ("iterations", iterations, 0), ("points_per_bone", points_per_bone, 6))
-    for name, found, least in ranges:
-        if found < least:
-            raise InputError(f"bones.{name}", expected=f"at least {least}", found=str(found))
-    if not surplus >= 1.0:
-        raise InputError("bones.surplus", expected="at least 1", found=str(surplus))
-    if not 0.0 <= prune * influences < 1.0:
-        raise InputError("bones.prune", expected="at least 0 and below 1 / influences", found=str(prune))
 
 
 def _thinned(chosen: np.ndarray) -> np.ndarray:

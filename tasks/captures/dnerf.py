@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -33,10 +33,10 @@ SAME_TIME = 1e-6
 def load(
     *,
     path: str,
-    size: int | None,
+    size: Annotated[int, "[1, inf)"] | None,
     background: Literal["none", "white", "black"],
     up: Literal["y", "z"],
-    fps: float,
+    fps: Annotated[float, "(0, inf)"],
     unit: Literal["unit", "m"],
 ) -> tuple[Capture, Capture]:
     """(train, test) captures of a folder in the layout above, the world turned so that up is +Y.

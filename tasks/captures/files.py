@@ -143,8 +143,6 @@ def _masked(image: np.ndarray, mask: np.ndarray, file: Path) -> np.ndarray:
 
 
 def _scaled(shape: tuple[int, int], size: int | None) -> tuple[int, int]:
-    if size is not None and size < 1:
-        raise InputError("dataset.size", expected="1 pixel or more, or null", found=str(size))
     if size is None or size >= max(shape):
         return shape
     return tuple(max(1, round(n * size / max(shape))) for n in shape)

@@ -33,7 +33,7 @@ import re
 import zipfile
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -47,7 +47,9 @@ IMAGES = (".png", ".jpg", ".jpeg")
 UNREADABLE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
 
 
-def load(*, path: str, size: int | None, background: Literal["none", "white", "black"]) -> tuple[Capture, Capture]:
+def load(
+    *, path: str, size: Annotated[int, "[1, inf)"] | None, background: Literal["none", "white", "black"]
+) -> tuple[Capture, Capture]:
     """(train, test) captures of a folder in the layout above.
 
     size: of the longer side at most: larger images are brought down; null: none are; background: behind images without

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -24,14 +24,18 @@ CAMERAS_OF_TRAINING, CAMERAS_OF_TEST, CAMERAS_OF_FRAMING = 0, 1, 2  # streams of
 
 
 def scene_motion(
-    motion: Motion, *, clip: str | None, frames: int | None, choose: Literal["first", "even", "resample"]
+    motion: Motion,
+    *,
+    clip: str | None,
+    frames: Annotated[int, "[2, inf)"] | None,
+    choose: Literal["first", "even", "resample"],
 ) -> Motion:
     """The frames of a motion that a scene shows, and the truth that what is fitted to it is held against.
 
     clip: one clip by its name, null for all. frames: how many, null for all; first: the first ones; even: spread
     evenly, first and last among them, both all where there are fewer; resample: that many, also more than there are,
     each clip by cubic interpolation over time (only where no skeleton comes with the data). Raises InputError for an
-    unknown clip and numbers out of range.
+    unknown clip.
 
     Where the data has no rest shape, its first frame becomes one: colours are painted on it, whichever frames are
     rendered later.
@@ -44,8 +48,6 @@ def scene_motion(
         motion = motion.take_clips([motion.clip_names.index(clip)])
     if frames is None:
         return motion
-    if frames < 2:
-        raise InputError("scene.frames", expected="2 or more, or null for all", found=str(frames))
     if choose == "resample":
         return motion if frames == motion.frames else _resampled(motion, frames)
     if frames >= motion.frames:
@@ -60,17 +62,17 @@ def scene_motion(
 def render_scene(
     motion: Motion,
     *,
-    size: int,
+    size: Annotated[int, "[1, inf)"],
     layout: Literal["monocular", "multiview"],
-    views: int,
-    test_views: int,
-    cameras: int,
-    test_cameras: int,
-    fill: float,
+    views: Annotated[int, "[1, inf)"],
+    test_views: Annotated[int, "[1, inf)"],
+    cameras: Annotated[int, "[1, inf)"],
+    test_cameras: Annotated[int, "[1, inf)"],
+    fill: Annotated[float, "(0, 1)"],
     follow: bool,
-    field_of_view: float,
-    samples: int,
-    shading: float,
+    field_of_view: Annotated[float, "(0, 170)"],
+    samples: Annotated[int, "[1, inf)"],
+    shading: Annotated[float, "[0, 1]"],
     seed: int,
 ) -> tuple[Capture, Capture]:
     """(train, test) captures of a moving mesh, rendered by rays.
@@ -84,9 +86,9 @@ def render_scene(
     so that a point's colour changes as it turns. Colours are a pattern on the shape at rest, the same for every seed.
 
     The rig comes along without skin weights: what is fitted to images has other points than the mesh. Raises InputError
-    for a motion without faces and for numbers out of range.
+    for a motion without faces.
     """
-    _check(motion, locals())
+    _check(motion)
     centre = (motion.points.min(1).astype(np.float64) + motion.points.max(1)) / 2
     middle = (centre.min(0) + centre.max(0)) / 2
     if layout == "monocular":
@@ -241,18 +243,9 @@ def _resampled(motion: Motion, frames: int) -> Motion:
     return replace(motion, points=np.concatenate(points), clip_start=edges, fps=fps)
 
 
-def _check(motion: Motion, given: dict) -> None:
+def _check(motion: Motion) -> None:
     if motion.faces is None:
         found, do = "bare points", "load it with dataset.faces=true"
         raise InputError(f"dataset {motion.name}", expected="a mesh to render", found=found, do=do)
-    used = ("views", "test_views") if given["layout"] == "monocular" else ("cameras", "test_cameras")
-    for name in ("size", "samples", *used):
-        if given[name] < 1:
-            raise InputError(f"scene.{name}", expected="1 or more", found=str(given[name]))
-    for name, low, high in (("fill", 0, 1), ("field_of_view", 0, 170)):
-        if not low < given[name] < high:
-            raise InputError(f"scene.{name}", expected=f"between {low} and {high}", found=str(given[name]))
-    if not 0 <= given["shading"] <= 1:
-        raise InputError("scene.shading", expected="0 to 1", found=str(given["shading"]))
     if not diagonal(motion.points[0]) > 0:
         raise InputError(f"dataset {motion.name}", expected="a shape", found="all points in one place")

@@ -7,7 +7,7 @@ Little endian: int32 frames F, vertices V, triangles T; float32 (V, 3) the first
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -20,7 +20,7 @@ EXPECTED = "an .anime file, or a folder of them for one animal"
 HEADER = 12  # bytes
 
 
-def load(*, path: str, files: str, fps: float, up: Literal["y", "z"]) -> Motion:
+def load(*, path: str, files: str, fps: Annotated[float, "(0, inf)"], up: Literal["y", "z"]) -> Motion:
     """Reads an animation, or all of one subject as clips.
 
     path: FILE.anime, or a folder in which every .anime file at any depth whose name fits `files`, as `bear3EP_*`, is a

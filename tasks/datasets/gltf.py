@@ -88,8 +88,6 @@ def read_glb(path: Path, *, fps: float) -> Decoded:
     Vertices at one place with the same weights are welded. Clips are called as in the file, without the armature's name
     before "|". Raises InputError for damaged files and for what is not supported.
     """
-    if not 0 < fps <= 1000:
-        raise InputError("dataset.fps", expected="a rate above 0 and up to 1000", found=str(fps))
     glb = Glb(path)
     try:
         return _decode(glb, fps)

@@ -6,7 +6,7 @@ import io
 import re
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -18,7 +18,7 @@ KINDS = (".obj", ".ply")
 EXPECTED = "an .npz file or a folder of .obj or .ply files"
 
 
-def load(*, path: str, fps: float, faces: bool, unit: Literal["unit", "m"]) -> Motion:
+def load(*, path: str, fps: Annotated[float, "(0, inf)"], faces: bool, unit: Literal["unit", "m"]) -> Motion:
     """Reads a mesh sequence.
 
     path: an .npz with `vertices` (F, V, 3) and `faces` (T, 3), optionally `clip_start` (C+1,), `clip_names` (C,) and

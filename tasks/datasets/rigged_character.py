@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -30,7 +30,13 @@ ARRAYS = (
 REPRODUCED = 1e-4  # of the diagonal: a file whose own check vertices differ by more was decoded in another way
 
 
-def load(*, path: str, fps: float, hierarchy: Literal["attached", "authored"], unit: Literal["unit", "m"]) -> Motion:
+def load(
+    *,
+    path: str,
+    fps: Annotated[float, "(0, 1000]"],
+    hierarchy: Literal["attached", "authored"],
+    unit: Literal["unit", "m"],
+) -> Motion:
     """Reads a rigged character: points by linear blend skinning, rest shape, and the rig in ``Motion.rig``.
 
     path: an .npz with rest_vertices (V, 3), faces (T, 3), weight_index and weight_value (V, I), joint_names (J,),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from fnmatch import fnmatch
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -26,7 +26,7 @@ TO_Y_UP = {"y": np.eye(3), "z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0
 _PC2 = b"POINTCACHE2\0"
 
 
-def load(*, path: str, files: str, fps: float, up: Literal["y", "z"]) -> Motion:
+def load(*, path: str, files: str, fps: Annotated[float, "(0, inf)"], up: Literal["y", "z"]) -> Motion:
     """Reads one garment on one body: every sequence is a clip, called after what its file's name adds to the others'.
 
     path: the folder, or one file; files: which of the folder's, as `*_shape00_*`; fps: of the simulation; up: the

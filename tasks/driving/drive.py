@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -33,8 +33,8 @@ def driving_poses(
     path: str | None,
     rename: list[str],
     up: Literal["y", "z"],
-    first: int,
-    frames: int | None,
+    first: Annotated[int, "[0, inf)"],
+    frames: Annotated[int, "[1, inf)"] | None,
 ) -> tuple[Motion, Poses, About]:
     """The motion of a file on this skeleton: its joints' path (F, J, 3) as a motion, the poses, and what was left out.
 
@@ -203,14 +203,12 @@ def _upright(driver: Driver) -> Driver:
 
 def _sampled(driver: Driver, fps: float, first: int, frames: int | None) -> Driver:
     """The same motion at another rate, from a frame on, cut to so many frames."""
-    if frames is not None and frames < 1:
-        raise InputError("drive.frames", expected="1 or more, or null for all", found=str(frames))
     if not driver.fps >= SLOWEST:
         raise InputError("drive.path: frame time", expected=f"at most {1 / SLOWEST:g} s", found=f"{1 / driver.fps:g} s")
     last = len(driver.rotations) - 1
     count = int(np.floor(last * fps / driver.fps + ROUNDED)) + 1
-    if not 0 <= first < count:
-        raise InputError("drive.first", expected=f"0 to {count - 1}", found=str(first))
+    if first >= count:
+        raise InputError("drive.first", expected=f"at most {count - 1}", found=str(first))
     at = np.minimum(np.arange(count)[first:][:frames] * (driver.fps / fps), last)
     a = np.minimum(at.astype(int), max(last - 1, 0))
     b, t = np.minimum(a + 1, last), (at - a)[:, None, None]

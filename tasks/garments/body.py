@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from importlib.util import find_spec
+from typing import Annotated
 
 import numpy as np
 
@@ -15,7 +16,15 @@ EXTRA = ("anny", "newton", "warp", "pybullet_data")  # modules of the extra `gar
 DIGITS = ("Thumb", "Index", "Middle", "Ring", "Pinky")  # these follow their hand
 
 
-def anny_body(*, gender: float, age: float, muscle: float, weight: float, height: float, proportions: float) -> Motion:
+def anny_body(
+    *,
+    gender: Annotated[float, "[0, 1]"],
+    age: Annotated[float, "[0, 1]"],
+    muscle: Annotated[float, "[0, 1]"],
+    weight: Annotated[float, "[0, 1]"],
+    height: Annotated[float, "[0, 1]"],
+    proportions: Annotated[float, "[0, 1]"],
+) -> Motion:
     """The body as a motion of one frame, its rest pose, with the `mixamo` rig, fingers merged into hands: 22 joints.
 
     The settings are Anny's phenotypes, each 0..1. Only the skin is kept (no eyes, teeth or tongue). The first start of

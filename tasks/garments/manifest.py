@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
@@ -19,7 +20,9 @@ from tasks.workspace import Workspace
 DEEP, STRAIN, FASTEST = 0.005, 0.15, 25.0
 
 
-def check_garment(body: Files, garment: Files, *, every: int, workspace: Workspace) -> tuple[Metrics, Files, About]:
+def check_garment(
+    body: Files, garment: Files, *, every: Annotated[int, "[1, inf)"], workspace: Workspace
+) -> tuple[Metrics, Files, About]:
     """Reads the packed files again and measures them: numbers for the report, the garment's part of the manifest, and
     which of the goals are missed, in words.
 
@@ -36,7 +39,7 @@ def check_garment(body: Files, garment: Files, *, every: int, workspace: Workspa
     return declared(numbers, "m"), part, About(name, tuple(_missed(facts)))
 
 
-def manifest(files: dict[str, Files], facts: dict[str, Files], *, every: int) -> Files:
+def manifest(files: dict[str, Files], facts: dict[str, Files], *, every: Annotated[int, "[1, inf)"]) -> Files:
     """``manifest.json``: size and sha256 of the files, and what :func:`check_garment` found."""
     stated = {
         "depth_measured_at_every": every,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from typing import Annotated
 
 import numpy as np
 
@@ -26,7 +27,7 @@ def pack_garment(
     poses: dict[str, Poses],
     cloth: dict[str, Motion],
     *,
-    step: float,
+    step: Annotated[float, "(0, inf)"],
     clips: list[str],
 ) -> Files:
     """``<garment>.npz`` of the named clips, in that order. poses: of the body, whose last clip is the cloth's frames;

@@ -6,7 +6,7 @@ the cloth's stress-free shape.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
@@ -34,12 +34,12 @@ def cut(
     body: Motion,
     *,
     garment: Literal["tshirt", "dress"],
-    edge: float,
+    edge: Annotated[float, "(0, inf)"],
     ease_top: float,
     ease_hem: float,
-    sleeve: float,
-    flare: float,
-    length: float,
+    sleeve: Annotated[float, "[0, inf)"],
+    flare: Annotated[float, "[0, inf)"],
+    length: Annotated[float, "(0, inf)"],
 ) -> Canonical:
     """The garment on the body in the cutting pose, an open triangle mesh.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Annotated
 
 import numpy as np
 
@@ -43,22 +44,20 @@ def motion_clip(
     body: Motion,
     *,
     clip: str,
-    cycles: float,
+    cycles: Annotated[float, "(0, inf)"],
     turn: float,
-    slow: float,
-    fps: float,
+    slow: Annotated[float, "(0, inf)"],
+    fps: Annotated[float, "(0, inf)"],
     spread: float,
     stand: float,
-    speed: float,
-    frames: int | None,
+    speed: Annotated[float, "(0, inf)"],
+    frames: Annotated[int, "[2, inf)"] | None,
 ) -> Poses:
     """A motion of the body from pybullet's wheel, lead-in and clip: :func:`tasks.garments.capture.read`, then
     :func:`retarget`, then :func:`lead_in` from standing with arms `stand` degrees off the body. frames: of the clip,
     at most, from its first on, or None for all."""
     capture = read(clip=clip, cycles=cycles, fps=fps, turn=turn, slow=slow)
     if frames is not None:
-        if frames < 2:
-            raise InputError("make.frames", expected="at least 2 frames, or null for all", found=str(frames))
         capture = replace(capture, local=capture.local[:frames], root=capture.root[:frames])
     return lead_in(body, retarget(body, capture, spread=spread), spread=stand, fps=fps, speed=speed)
 
@@ -135,7 +134,9 @@ def lead_in(body: Motion, poses: Poses, *, spread: float, fps: float, speed: flo
     )
 
 
-def dressing(body: Motion, start: Poses, *, spread: float, frames: int, hold: int) -> Poses:
+def dressing(
+    body: Motion, start: Poses, *, spread: float, frames: Annotated[int, "[1, inf)"], hold: Annotated[int, "[0, inf)"]
+) -> Poses:
     """From the pose `start` (its first frame) to standing in `frames` frames, then `hold` frames of standing still:
     where a garment settles before any clip."""
     rig = _checked(body)

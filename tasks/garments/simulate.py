@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
@@ -102,17 +103,17 @@ def simulate_frames(
     poses: Poses,
     settled: Cloth | None = None,
     *,
-    fps: float,
-    substeps: int,
-    iterations: int,
-    density: float,
-    stretch: float,
-    bend: float,
-    damping: float,
-    contact: float,
-    friction: float,
-    thickness: float,
-    drag: float,
+    fps: Annotated[float, "(0, inf)"],
+    substeps: Annotated[int, "[1, inf)"],
+    iterations: Annotated[int, "[1, inf)"],
+    density: Annotated[float, "(0, inf)"],
+    stretch: Annotated[float, "[0, inf)"],
+    bend: Annotated[float, "[0, inf)"],
+    damping: Annotated[float, "[0, inf)"],
+    contact: Annotated[float, "[0, inf)"],
+    friction: Annotated[float, "[0, inf)"],
+    thickness: Annotated[float, "(0, inf)"],
+    drag: Annotated[float, "[0, inf)"],
     workspace: Workspace,
 ) -> tuple[Motion, Cloth]:
     """The cloth over all frames of the poses: the frames of their last clip as a motion, and the state after the last.

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
 
-from tasks.errors import InputError
 from tasks.geometry.kinematics import forward
 from tasks.geometry.skinning import skin
 from tasks.motion.harmonic import biharmonic_weights
@@ -12,14 +13,12 @@ from tasks.motion.query import check_poses
 from tasks.values import Animation, Poses, Training
 
 
-def animate(training: Training, query: Poses, *, cells: int) -> Animation:
+def animate(training: Training, query: Poses, *, cells: Annotated[int, "[8, inf)"]) -> Animation:
     """Poses -> points by forward kinematics and weights that shape and bones alone decide (Jacobson et al. 2011).
 
     cells: of the lattice that they are solved on, at most; 3,000 take some 10 s. Raises InputError for poses of another
     skeleton, matrices that are no rotations, and too few cells.
     """
-    if cells < 8:
-        raise InputError("animate.cells", expected="8 or more", found=str(cells))
     check_poses(query, training.skeleton, "query")
     skeleton = training.skeleton
     weights = biharmonic_weights(training.canonical, skeleton, cells=cells)

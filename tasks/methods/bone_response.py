@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
 
-from tasks.errors import InputError
 from tasks.geometry.skinning import skin
 from tasks.motion import kernel, response
 from tasks.motion.posed import Posed
@@ -17,29 +18,20 @@ def animate(
     training: Training,
     query: Poses,
     *,
-    lag: int,
-    lags: int,
+    lag: Annotated[int, "[1, inf)"],
+    lags: Annotated[int, "[0, inf)"],
     pose: bool,
-    width: float,
-    ridge: float,
-    landmarks: int,
+    width: Annotated[float, "(0, inf)"],
+    ridge: Annotated[float, "(0, inf)"],
+    landmarks: Annotated[int, "[2, inf)"],
 ) -> Animation:
     """Poses -> points: residuals on the skeleton's skinning, in two steps, then skinning by W.
 
     First :mod:`tasks.motion.response`, bone by bone, on now and ``lags`` earlier moments, ``lag`` frames apart. Then,
     with ``pose``, kernel ridge regression on each part's pose of what that leaves of clips it did not see; width, ridge
     and landmarks as in :func:`tasks.motion.kernel.fit`, tuned on left-out training clips. Not in the paper.
-    Raises InputError for bad poses and numbers out of range.
+    Raises InputError for bad poses.
     """
-    for name, good, expected, found in (
-        ("lag", lag >= 1, "1 or more frames", lag),
-        ("lags", lags >= 0, "0 or more", lags),
-        ("width", width > 0, "a positive number", width),
-        ("ridge", ridge > 0, "a positive number", ridge),
-        ("landmarks", landmarks >= 2, "2 or more frames", landmarks),
-    ):
-        if not good:
-            raise InputError(f"animate.{name}", expected=expected, found=str(found))
     check_poses(query, training.skeleton, "query")
     known, asked = Posed(training, training.database.poses), Posed(training, query)
     unit = shape_units(training)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from tasks.motion.nets import Recipe, animate_with
 from tasks.values import Animation, Poses, Training
@@ -12,10 +12,10 @@ def animate(
     training: Training,
     query: Poses,
     *,
-    hidden: int,
-    steps: int,
-    patience: int,
-    rate: float,
+    hidden: Annotated[int, "[1, inf)"],
+    steps: Annotated[int, "[1, inf)"],
+    patience: Annotated[int, "[1, inf)"],
+    rate: Annotated[float, "(0, inf)"],
     represent: Literal["root", "residual"],
     dynamics: bool,
     mirror: bool,

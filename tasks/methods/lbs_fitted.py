@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
 
-from tasks.errors import InputError
 from tasks.geometry import rigid
 from tasks.geometry.skinning import skin
 from tasks.motion.fitting import fit_weights
@@ -13,18 +14,14 @@ from tasks.motion.query import check_poses
 from tasks.values import Animation, Poses, Training
 
 
-def animate(training: Training, query: Poses, *, influences: int, keep: float) -> Animation:
+def animate(
+    training: Training, query: Poses, *, influences: Annotated[int, "[1, inf)"], keep: Annotated[float, "[0, inf)"]
+) -> Animation:
     """Poses -> points by forward kinematics and weights that were fitted to the training points.
 
     influences: joints a point may follow; keep: pull towards the skeleton's own weights, which decide where the
-    training frames do not. Raises InputError for bad poses and numbers out of range.
+    training frames do not. Raises InputError for bad poses.
     """
-    for name, good, expected, found in (
-        ("influences", influences >= 1, "1 or more", influences),
-        ("keep", keep >= 0, "0 or a positive weight", keep),
-    ):
-        if not good:
-            raise InputError(f"animate.{name}", expected=expected, found=str(found))
     check_poses(query, training.skeleton, "query")
     known, asked = Posed(training, training.database.poses), Posed(training, query)
     away = rigid.inverse(known.world[:, known.root])[:, None]  # global motion tells nothing about weights

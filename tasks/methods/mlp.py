@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Literal
+from typing import Annotated, Literal
 
 from tasks.motion.nets import Recipe, animate_with
 from tasks.values import Animation, Poses, Training
@@ -15,10 +15,10 @@ def animate(
     training: Training,
     query: Poses,
     *,
-    hidden: int,
-    steps: int,
-    patience: int,
-    rate: float,
+    hidden: Annotated[int, "[1, inf)"],
+    steps: Annotated[int, "[1, inf)"],
+    patience: Annotated[int, "[1, inf)"],
+    rate: Annotated[float, "(0, inf)"],
     represent: Literal["root", "residual"],
     dynamics: bool,
     mirror: bool,
@@ -29,7 +29,7 @@ def animate(
     hidden: units of a layer; steps, patience, rate: of Adam, stopped by a held-back training clip;
     represent: bones relative to the model's ``root`` or their ``residual`` on the skeleton's skinning;
     dynamics: also show it the root's velocity, acceleration and angular velocity; mirror: train on the clips' mirror
-    images as well, where the character is symmetric. Raises InputError for bad poses and numbers out of range.
+    images as well, where the character is symmetric. Raises InputError for bad poses.
     """
 
     def make(inputs: int, width: int, outputs: int):

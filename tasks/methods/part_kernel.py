@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
-from tasks.errors import InputError
 from tasks.geometry.skinning import skin
 from tasks.motion import kernel
 from tasks.motion.mirror import mirrored
@@ -21,12 +20,12 @@ def animate(
     query: Poses,
     *,
     represent: Literal["root", "residual"],
-    dynamics: float,
-    reach: int,
-    width: float,
-    ridge: float,
+    dynamics: Annotated[float, "[0, inf)"],
+    reach: Annotated[int, "[0, inf)"],
+    width: Annotated[float, "(0, inf)"],
+    ridge: Annotated[float, "(0, inf)"],
     tune: bool,
-    landmarks: int,
+    landmarks: Annotated[int, "[2, inf)"],
     mirror: bool,
 ) -> Animation:
     """Poses -> points: each part's bones by kernel ridge regression on its pose, then skinning by W.
@@ -38,17 +37,8 @@ def animate(
     width, ridge, tune, landmarks: see :func:`tasks.motion.kernel.fit`; tuning looks at training clips alone.
     mirror: learn from the training clips' mirror images as well, where the character is symmetric and, with
     ``tune``, where that predicts left-out clips better.
-    Raises InputError for bad poses (as PartMM) and numbers out of range.
+    Raises InputError for bad poses (as PartMM).
     """
-    for name, good, expected, found in (
-        ("reach", reach >= 0, "0 or more frames", reach),
-        ("width", width > 0, "a positive number", width),
-        ("ridge", ridge > 0, "a positive number", ridge),
-        ("dynamics", dynamics >= 0, "0 (off) or a positive weight", dynamics),
-        ("landmarks", landmarks >= 2, "2 or more frames", landmarks),
-    ):
-        if not good:
-            raise InputError(f"animate.{name}", expected=expected, found=str(found))
     check_poses(query, training.skeleton, "query")
     known, asked = Posed(training, training.database.poses), Posed(training, query)
     image = mirrored(training) if mirror else None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from tasks.geometry.skinning import skin
 from tasks.motion.matching import Way, match
@@ -13,17 +13,17 @@ def animate(
     training: Training,
     query: Poses,
     *,
-    k: int,
-    patch: int,
-    levels: int,
-    lambda_: float,
-    temperature: float,
+    k: Annotated[int, "[1, inf)"],
+    patch: Annotated[int, "[1, inf)"],
+    levels: Annotated[int, "[1, inf)"],
+    lambda_: Annotated[float, "(0, 1]"],
+    temperature: Annotated[float, "(0, inf)"],
     represent: Literal["root", "part", "residual"],
     align: bool,
-    dynamics: float,
+    dynamics: Annotated[float, "[0, inf)"],
     shrink: bool,
     mirror: bool,
-    sources: int,
+    sources: Annotated[int, "[0, inf)"],
 ) -> Animation:
     """Poses -> points by partwise motion matching (GaussiAnimate 3.3, eq. 7-10 and alg. 1), then skinning by W.
 
@@ -42,7 +42,7 @@ def animate(
     nearest, by the shares that predict the query's pose from theirs (:mod:`tasks.motion.affine`); 0 is the paper's.
 
     Clips of the query shorter than a patch are padded with their last pose. Raises InputError for poses of another
-    skeleton, matrices that are no rotations, training clips all shorter than a patch and numbers out of range.
+    skeleton, matrices that are no rotations, and training clips all shorter than a patch.
     """
     way = Way(k, patch, levels, lambda_, temperature, represent, align, dynamics, shrink, mirror, sources)
     found = match(training, query, way)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Annotated
 
 import numpy as np
 
-from tasks.errors import InputError
 from tasks.motion.matching import one_clip
 from tasks.motion.posed import Posed
 from tasks.motion.query import check_poses
@@ -18,22 +18,22 @@ LEAST = 5  # frames that a line is fitted to
 TINY = 1e-4  # radians and body units below which differences mean nothing
 
 
-def confidence(training: Training, query: Poses, *, k: int, patch: int, dynamics: float) -> Confidence:
+def confidence(
+    training: Training,
+    query: Poses,
+    *,
+    k: Annotated[int, "[1, inf)"],
+    patch: Annotated[int, "[1, inf)"],
+    dynamics: Annotated[float, "[0, inf)"],
+) -> Confidence:
     """What to think of any method's answer to the query, from the poses alone.
 
     k, patch, dynamics: of the windows that are compared, as in matching. A frame's distance is the mean over parts and
     their k nearest windows. It is calibrated on the training clips, each matched against the others: than how many of
     their frames it is farther, and by a power law what error matching made there. (Of distances, differences between
     matches and motion, the mean distance alone ranked the errors of left-out training clips best.)
-    Raises InputError for bad poses and numbers out of range.
+    Raises InputError for bad poses.
     """
-    for name, good, expected, found in (
-        ("k", k >= 1, "1 or more windows", k),
-        ("patch", patch >= 1, "1 or more frames", patch),
-        ("dynamics", dynamics >= 0, "0 (off) or a positive weight", dynamics),
-    ):
-        if not good:
-            raise InputError(f"confidence.{name}", expected=expected, found=str(found))
     check_poses(query, training.skeleton, "query")
     known = Posed(training, training.database.poses)
 

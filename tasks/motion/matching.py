@@ -23,7 +23,8 @@ from tasks.values import Poses, Training
 
 @dataclass(frozen=True)
 class Way:
-    """How to match, as :func:`tasks.methods.partmm.animate` explains it. Raises InputError for numbers out of range."""
+    """How to match, as :func:`tasks.methods.partmm.animate` explains it. Raises InputError for settings that exclude
+    each other."""
 
     k: int
     patch: int
@@ -38,18 +39,6 @@ class Way:
     sources: int
 
     def __post_init__(self) -> None:
-        for name, good, expected in (
-            ("k", self.k >= 1, "1 or more"),
-            ("patch", self.patch >= 1, "1 or more frames"),
-            ("levels", self.levels >= 1, "1 or more"),
-            ("lambda_", 0 < self.lambda_ <= 1, "a number in (0, 1]"),
-            ("temperature", self.temperature > 0, "a positive number"),
-            ("dynamics", self.dynamics >= 0, "0 (off) or a positive weight"),
-            ("sources", self.sources >= 0, "0 (softmax) or how many"),
-            ("represent", self.represent in ("root", "part", "residual"), "root, part or residual"),
-        ):
-            if not good:
-                raise InputError(f"animate.{name.rstrip('_')}", expected=expected, found=str(getattr(self, name)))
         if self.shrink and self.represent != "residual":
             expected = "false without represent=residual (there is nothing to shrink towards)"
             raise InputError("animate.shrink", expected=expected, found="true")

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tasks.errors import InputError
 from tasks.geometry.rotations import to_rotation_vector
 from tasks.geometry.skinning import skin
 from tasks.motion.mirror import mirrored
@@ -39,16 +38,6 @@ class Recipe:
     dynamics: bool
     mirror: bool
     seed: int
-
-    def __post_init__(self) -> None:
-        for name, good, expected in (
-            ("hidden", self.hidden >= 1, "1 or more units"),
-            ("steps", self.steps >= 1, "1 or more"),
-            ("patience", self.patience >= 1, "1 or more steps"),
-            ("rate", self.rate > 0, "a positive learning rate"),
-        ):
-            if not good:
-                raise InputError(f"animate.{name}", expected=expected, found=str(getattr(self, name)))
 
 
 def animate_with(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import combinations
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -21,8 +21,8 @@ def find_parts(
     *,
     kind: Literal["auto", "whole", "named"],
     named: list[str],
-    overlap: int,
-    affinity: float,
+    overlap: Annotated[int, "[0, inf)"],
+    affinity: Annotated[float, "[0, 1)"],
 ) -> Parts:
     """Parts for partwise matching (GaussiAnimate 3.3 and 4.1: five overlapping parts, user-defined where wanted).
 
@@ -34,12 +34,8 @@ def find_parts(
 
     Joints that move no skin, such as helpers of an animator's rig, belong to no part. An automatic part without bones
     is dropped (its joints move nothing that the bones can show). Raises InputError for a named part without bones,
-    unknown part or joint names, joints that move skin but are in no part, and numbers out of range.
+    unknown part or joint names, and joints that move skin but are in no part.
     """
-    if overlap < 0:
-        raise InputError("parts.overlap", expected="0 or more joints", found=str(overlap))
-    if not 0 <= affinity < 1:
-        raise InputError("parts.affinity", expected="a share in [0, 1)", found=str(affinity))
     moves = carrying(skeleton)
     if kind == "whole":
         groups = {"whole": moves}

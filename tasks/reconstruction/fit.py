@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
-from typing import Literal
+from typing import Annotated, Literal
 
 from tasks.errors import InputError
 from tasks.values import Capture, Reconstruction
@@ -15,46 +15,46 @@ def fit(
     *,
     deformation: Literal["nodes", "mlp"],
     backend: Literal["numba", "gsplat", "reference"],
-    iterations: int,
-    largest: int,
+    iterations: Annotated[int, "[1, inf)"],
+    largest: Annotated[int, "[1, inf)"],
     start: Literal["hull", "ball"],
-    reference: int | None,
-    hull_views: int,
-    hull_agree: float,
-    hull_cells: int,
-    static: float,
-    grown: float,
-    coarsest: float,
-    full: float,
-    gaussians: int,
-    max_gaussians: int,
-    growth: float,
-    divide_every: int,
-    divide_until: float,
-    least_shown: float,
-    sh_degree: int,
-    structure: float,
-    cover: float,
+    reference: Annotated[int, "[0, inf)"] | None,
+    hull_views: Annotated[int, "[1, inf)"],
+    hull_agree: Annotated[float, "[0, 1]"],
+    hull_cells: Annotated[int, "[1, inf)"],
+    static: Annotated[float, "[0, 1]"],
+    grown: Annotated[float, "[0, 1]"],
+    coarsest: Annotated[float, "(0, 1]"],
+    full: Annotated[float, "[0, 1]"],
+    gaussians: Annotated[int, "[1, inf)"],
+    max_gaussians: Annotated[int, "[1, inf)"],
+    growth: Annotated[float, "[0, inf)"],
+    divide_every: Annotated[int, "[1, inf)"],
+    divide_until: Annotated[float, "[0, 1]"],
+    least_shown: Annotated[float, "[0, inf)"],
+    sh_degree: Annotated[int, "[0, 3]"],
+    structure: Annotated[float, "[0, 1]"],
+    cover: Annotated[float, "[0, inf)"],
     arap: Literal["off", "own", "svd"],
-    arap_weight: float,
-    distance_weight: float,
-    rigidity_end: float,
-    neighbours: int,
-    carriers: int,
-    images_per_knot: float,
-    frames_per_knot: float,
-    smooth_weight: float,
-    depth: int,
-    width: int,
-    skip: int,
+    arap_weight: Annotated[float, "[0, inf)"],
+    distance_weight: Annotated[float, "[0, inf)"],
+    rigidity_end: Annotated[float, "[0, 1]"],
+    neighbours: Annotated[int, "[1, inf)"],
+    carriers: Annotated[int, "[1, inf)"],
+    images_per_knot: Annotated[float, "(0, inf)"],
+    frames_per_knot: Annotated[float, "(0, inf)"],
+    smooth_weight: Annotated[float, "[0, inf)"],
+    depth: Annotated[int, "[1, inf)"],
+    width: Annotated[int, "[1, inf)"],
+    skip: Annotated[int, "[0, inf)"],
     deltas: bool,
-    rate_means: float,
-    rate_scales: float,
-    rate_opacities: float,
-    rate_colours: float,
-    rate_deformation: float,
-    rate_end: float,
-    averaged: float,
+    rate_means: Annotated[float, "(0, inf)"],
+    rate_scales: Annotated[float, "(0, inf)"],
+    rate_opacities: Annotated[float, "(0, inf)"],
+    rate_colours: Annotated[float, "(0, inf)"],
+    rate_deformation: Annotated[float, "(0, inf)"],
+    rate_end: Annotated[float, "(0, inf)"],
+    averaged: Annotated[float, "[0, 1]"],
     seed: int,
     workspace: Workspace,
 ) -> Reconstruction:
@@ -93,20 +93,8 @@ def fit(
 
 
 def _check(recipe: dict) -> None:
-    """Raises InputError for the first setting that makes no sense."""
-    whole = ("iterations", "largest", "hull_views", "hull_cells", "gaussians", "divide_every", "neighbours", "carriers")
-    rules = [(n, recipe[n] >= 1, "1 or more") for n in (*whole, "depth", "width")]
-    shares = ("hull_agree", "static", "grown", "full", "divide_until", "structure", "averaged", "rigidity_end")
-    rules += [(n, 0.0 <= recipe[n] <= 1.0, "a share, 0 to 1") for n in shares]
-    rates = [n for n in recipe if n.startswith("rate_")]
-    weights = ("cover", "arap_weight", "distance_weight", "smooth_weight")
-    rules += [
-        (n, recipe[n] > 0, "a positive number") for n in (*rates, "coarsest", "images_per_knot", "frames_per_knot")
-    ]
-    rules += [(n, recipe[n] >= 0, "0 or more") for n in (*weights, "growth", "least_shown")]
-    rules += [
-        ("sh_degree", 0 <= recipe["sh_degree"] <= 3, "0, 1, 2 or 3"),
-        ("coarsest", recipe["coarsest"] <= 1, "at most 1"),
+    """Raises InputError for the first setting that makes no sense beside another."""
+    rules = [
         ("max_gaussians", recipe["max_gaussians"] >= recipe["gaussians"], f"at least {recipe['gaussians']}"),
         ("grown", recipe["grown"] >= recipe["static"], f"at least static, {recipe['static']}"),
         ("backend", recipe["backend"] != "gsplat" or recipe["deformation"] == "mlp", "numba with deformation=nodes"),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import igl
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -18,13 +20,13 @@ from tasks.values import Curve, Surface
 def curve_skeleton(
     surface: Surface,
     *,
-    speed: float,
-    medial: float,
-    edge: float,
-    angle: float,
-    stop: float,
-    rounds: int,
-    twig: float,
+    speed: Annotated[float, "[1e-4, 100]"],
+    medial: Annotated[float, "[0, 100]"],
+    edge: Annotated[float, "[1e-4, 0.1]"],
+    angle: Annotated[float, "[60, 180]"],
+    stop: Annotated[float, "[0, 1]"],
+    rounds: Annotated[int, "[1, 10000]"],
+    twig: Annotated[float, "[0, 100]"],
 ) -> Curve:
     """Mean curvature skeleton (Tagliasacchi et al. 2012) with the map from the surface to its curve.
 
@@ -35,9 +37,9 @@ def curve_skeleton(
     times the body's inner radius where it branches off. A body with handles gives a curve with loops: each is cut at
     its longest edge, so that the curve is a forest, one tree for each component of the surface.
 
-    Raises InputError for a surface that is not closed or a setting out of range.
+    Raises InputError for a surface that is not closed.
     """
-    _check_settings(surface, speed, medial, edge, angle, stop, rounds, twig)
+    _check(surface)
     vertices, faces = surface.vertices.astype(np.float64), surface.faces.astype(np.int64)
     poles = flow.medial_poles(vertices, faces)
     length = edge * diagonal(vertices)
@@ -85,9 +87,7 @@ def _cut_loops(nodes: np.ndarray, edges: np.ndarray) -> np.ndarray:
     return np.sort(np.stack(tree.nonzero(), axis=1), axis=1)
 
 
-def _check_settings(
-    surface: Surface, speed: float, medial: float, edge: float, angle: float, stop: float, rounds: int, twig: float
-) -> None:
+def _check(surface: Surface) -> None:
     if not is_closed(surface.faces, len(surface.vertices)):
         raise InputError(
             "Surface.faces",
@@ -95,15 +95,3 @@ def _check_settings(
             found=f"{len(surface.faces)} triangles that do not close",
             do="make it with closed_surface",
         )
-    limits = (
-        ("speed", speed, 1e-4, 100.0),
-        ("medial", medial, 0.0, 100.0),
-        ("edge", edge, 1e-4, 0.1),
-        ("angle", angle, 60.0, 180.0),
-        ("stop", stop, 0.0, 1.0),
-        ("rounds", rounds, 1, 10_000),
-        ("twig", twig, 0.0, 100.0),
-    )
-    for name, value, low, high in limits:
-        if not low <= value <= high:
-            raise InputError(f"skeleton.curve.{name}", expected=f"{low:g} to {high:g}", found=f"{value:g}")

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import Annotated
 
 import numpy as np
 
-from tasks.errors import InputError
 from tasks.geometry.measure import diagonal
 from tasks.skeleton.curve_weights import node_weights, onto_surface
 from tasks.skeleton.refit import refit
@@ -22,10 +22,10 @@ def joints_by_gradient(
     surface: Surface,
     curve: Curve,
     *,
-    tau: float,
-    spacing: float,
-    refits: int,
-    influences: int,
+    tau: Annotated[float, "(0, 1)"],
+    spacing: Annotated[float, "(0, 0.2)"],
+    refits: Annotated[int, "[0, inf)"],
+    influences: Annotated[int, "[1, inf)"],
 ) -> Skeleton:
     """GA eq. 5: g(s) = 1/2 |W(s + h) - W(s - h)|_1 along every branch of the evenly resampled curve; a joint is a
     local maximum of g above ``tau``, and every junction and leaf. The tree is the curve's own, contracted onto the
@@ -33,13 +33,8 @@ def joints_by_gradient(
 
     The paper says nothing of the skeleton's own skin weights: every point starts with the joint above it on the curve,
     then ``refits`` rounds fit weights of at most ``influences`` joints to the motion; the joints stay where they are.
-    tau: 0..1 (g has no unit); spacing: h as a share of the bounding-box diagonal. Raises InputError for settings out
-    of range.
+    tau: 0..1 (g has no unit); spacing: h as a share of the bounding-box diagonal.
     """
-    if not 0.0 < tau < 1.0:
-        raise InputError("skeleton.gradient.tau", expected="0 < tau < 1", found=str(tau))
-    if not 0.0 < spacing < 0.2:
-        raise InputError("skeleton.gradient.spacing", expected="0 < spacing < 0.2 of the diagonal", found=str(spacing))
     size = diagonal(canonical.points)
     weights = node_weights(curve, onto_surface(canonical, surface).carry(skinning.weights))
     branches = resample(curve.nodes, curve.edges, weights, spacing * size)

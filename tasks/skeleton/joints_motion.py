@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import igl
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from tasks.errors import InputError
 from tasks.geometry.measure import diagonal
 from tasks.geometry.moments import skin_error, skin_moments
 from tasks.geometry.neighbours import adjacency, mesh_edges
@@ -105,19 +104,19 @@ def joints_by_motion(
     surface: Surface,
     curve: Curve,
     *,
-    max_joints: int,
+    max_joints: Annotated[int, "[1, 500]"],
     topology: Literal["auto", "motion", "curve"],
-    rigid_residual: float,
-    knee: float,
-    missed: float,
-    angle: float,
-    shortest: float,
-    reach: float,
-    hinge: float,
+    rigid_residual: Annotated[float, "[0, inf)"],
+    knee: Annotated[float, "[1, 100]"],
+    missed: Annotated[float, "[0, 90]"],
+    angle: Annotated[float, "[0, 90]"],
+    shortest: Annotated[float, "[0, inf)"],
+    reach: Annotated[float, "[0, inf)"],
+    hinge: Annotated[float, "[0, 0.5]"],
     symmetric: bool,
-    rounds: int,
-    refits: int,
-    influences: int,
+    rounds: Annotated[int, "[0, inf)"],
+    refits: Annotated[int, "[0, inf)"],
+    influences: Annotated[int, "[1, 16]"],
 ) -> Skeleton:
     """Few bones that explain the motion (:mod:`tasks.skeleton.inner_bones`), joints where two of them carry the same
     point along (:mod:`tasks.skeleton.articulation`), a tree over them, then weights and joints refitted to the motion
@@ -133,9 +132,8 @@ def joints_by_motion(
     an axis with less than this share of the squared turn a joint goes to where its bones' skins meet; symmetric: left
     and right of a shape that is its own mirror image get mirrored joints; rounds: of SSDR once the bones are chosen;
     refits: rounds of refitting; influences: most joints a point may follow. Lengths are shares of the bounding-box
-    diagonal. Raises InputError for settings out of range.
+    diagonal.
     """
-    _check_settings(max_joints, influences, knee, angle, missed, hinge)
     size = diagonal(canonical.points)
     chosen = thin(canonical, surface, curve, _POINTS)
     body = Body(
@@ -398,16 +396,3 @@ def _link_of(links: np.ndarray) -> dict[tuple[int, int], int]:
 def _middles(share: np.ndarray, curve: Curve) -> np.ndarray:
     """(B, 3) mean of the curve's nodes under each bone's share (M, B)."""
     return (share.T @ curve.nodes) / share.sum(axis=0)[:, None]
-
-
-def _check_settings(max_joints: int, influences: int, knee: float, angle: float, missed: float, hinge: float) -> None:
-    for name, value, low, high in (
-        ("max_joints", max_joints, 1, 500),
-        ("influences", influences, 1, 16),
-        ("knee", knee, 1.0, 100.0),
-        ("angle", angle, 0.0, 90.0),
-        ("missed", missed, 0.0, 90.0),
-        ("hinge", hinge, 0.0, 0.5),
-    ):
-        if not low <= value <= high:
-            raise InputError(f"skeleton.motion.{name}", expected=f"{low} to {high}", found=str(value))

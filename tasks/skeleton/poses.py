@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
 
 from tasks.errors import InputError
@@ -12,7 +14,13 @@ from tasks.values import Canonical, Motion, Poses, Skeleton
 
 
 def fit_poses(
-    motion: Motion, canonical: Canonical, skeleton: Skeleton, *, steps: int, damping: float, stiffness: float
+    motion: Motion,
+    canonical: Canonical,
+    skeleton: Skeleton,
+    *,
+    steps: Annotated[int, "[0, inf)"],
+    damping: Annotated[float, "[0, inf)"],
+    stiffness: Annotated[float, "[0, inf)"],
 ) -> Poses:
     """Local rotations and root translation per frame that bring the skinned canonical shape onto the points.
 

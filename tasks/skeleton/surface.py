@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -21,7 +21,12 @@ _FLAT = 1e-4  # least over largest singular value of points that span a volume
 
 
 def closed_surface(
-    canonical: Canonical, *, vertices: int, cells: int, neighbours: int, remesh: Literal["edges", "isotropic"]
+    canonical: Canonical,
+    *,
+    vertices: Annotated[int, "[100, 1000000]"],
+    cells: Annotated[int, "[16, 1024]"],
+    neighbours: Annotated[int, "[4, 100]"],
+    remesh: Literal["edges", "isotropic"],
 ) -> Surface:
     """One closed component round the canonical shape, with about `vertices` vertices.
 
@@ -31,9 +36,9 @@ def closed_surface(
     generalised winding number tells from its surroundings (Jacobson et al. 2013; Barill et al. 2018), on a grid of
     `cells` along the longest side. Bare points get their normals from `neighbours` nearest points.
 
-    Raises InputError when the points enclose no volume or a setting is out of range.
+    Raises InputError when the points enclose no volume.
     """
-    _check(canonical, vertices, cells, neighbours)
+    _check(canonical)
     points = canonical.points.astype(np.float64)
     position, faces = _one_component(points, canonical.faces, cells, neighbours)
     if not vertices / 2 <= len(position) <= vertices * 2:
@@ -76,14 +81,7 @@ def _volume(vertices: np.ndarray, faces: np.ndarray) -> float:
     return float(np.einsum("ij,ij->", a, np.cross(b, c))) / 6.0
 
 
-def _check(canonical: Canonical, vertices: int, cells: int, neighbours: int) -> None:
-    for name, value, low, high in (
-        ("vertices", vertices, 100, 1_000_000),
-        ("cells", cells, 16, 1024),
-        ("neighbours", neighbours, 4, 100),
-    ):
-        if not low <= value <= high:
-            raise InputError(f"skeleton.surface.{name}", expected=f"{low} to {high}", found=str(value))
+def _check(canonical: Canonical) -> None:
     spread = canonical.points - canonical.points.mean(axis=0)
     extent = np.linalg.svd(spread.astype(np.float64), compute_uv=False)
     if len(spread) < 4 or not extent[2] > _FLAT * extent[0]:

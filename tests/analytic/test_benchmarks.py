@@ -210,10 +210,9 @@ def test_scale_times_every_size_and_draws_them():
     assert picture.svg.startswith("<svg")
 
 
-@pytest.mark.parametrize("wrong", [{"shares": [1.0]}, {"shares": [0.0, 1.0]}, {"subdivisions": 0}, {"repeats": 0}])
-def test_scale_settings_out_of_range_are_named(wrong):
-    settings = {"subdivisions": 1, "shares": [0.5, 1.0], "repeats": 1, "threads": 1} | wrong
-    with pytest.raises(InputError, match=next(iter(wrong))):
+def test_one_share_has_no_slope():
+    settings = {"subdivisions": 1, "shares": [1.0], "repeats": 1, "threads": 1}
+    with pytest.raises(InputError, match="shares"):
         scale_bones(*bending_rod(frames=3), **OURS, **settings)
 
 
@@ -253,12 +252,9 @@ def test_a_rasterizer_that_is_ours_has_ratios_near_one(monkeypatch):
     assert found["forward_ratio"] == found[f"forward_ratio@{case}"]
 
 
-@pytest.mark.parametrize(
-    ("changed", "said"), [({"gaussians": [1]}, "benchmark.gaussians"), ({"repeats": 0}, "repeats")]
-)
-def test_rasterizer_settings_out_of_range(changed, said):
-    with pytest.raises(InputError, match=said):
-        rasterizer.benchmark_rasterizer(a_ball(), **(RASTER | changed))
+def test_rasterizer_without_cases():
+    with pytest.raises(InputError, match=r"benchmark\.gaussians"):
+        rasterizer.benchmark_rasterizer(a_ball(), **(RASTER | {"gaussians": []}))
 
 
 @pytest.mark.slow

@@ -9,12 +9,10 @@ import pytest
 import trimesh
 
 from tasks.datasets import rigged_character
-from tasks.errors import InputError
 from tasks.geometry import kinematics
 from tasks.geometry.lattice import lattice
 from tasks.geometry.measure import diagonal, vertex_rmse
 from tasks.geometry.skinning import skin
-from tasks.methods import bbw
 from tasks.motion.harmonic import biharmonic_weights, handles
 from tasks.values import Canonical, Skeleton
 
@@ -102,8 +100,3 @@ def test_on_a_real_rig_far_better_than_the_nearest_bone(shared_data):
     error, hard_error = (vertex_rmse(skin(motion.rest, w, posed), motion.points[some]) for w in (weights, hard))
     assert error < 0.012 * diagonal(motion.rest)
     assert error < hard_error
-
-
-def test_bad_settings():
-    with pytest.raises(InputError, match=r"animate.cells.*8 or more"):
-        bbw.animate(None, None, cells=3)

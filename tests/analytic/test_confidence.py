@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tasks.errors import InputError
 from tasks.evaluation.confidence import confidence_file, confidence_picture, evaluate_confidence
 from tasks.methods import partmm
 from tasks.motion import confidence as module
@@ -102,9 +101,7 @@ def test_one_clip_leaves_nothing_to_judge_by(train):
     assert evaluate_confidence(found, Animation(train.motion.points[60:120]), train.motion.take_clips([1])).names == ()
 
 
-def test_clips_shorter_than_a_patch_are_padded_and_bad_settings_refused(train):
+def test_clips_shorter_than_a_patch_are_padded(train):
     poses = planted.poses(CLIPS)
     short = Poses(poses.rotations[:3], poses.translations[:3], np.array([0, 3]))
     assert len(confidence(train, short, **SETTINGS).expected) == 3
-    with pytest.raises(InputError, match=r"confidence\.k"):
-        confidence(train, short, **SETTINGS | {"k": 0})

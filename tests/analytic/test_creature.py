@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from tasks.datasets.creature import load
-from tasks.errors import InputError
 from tasks.geometry import kinematics, measure, neighbours, rotations, skinning
 from tasks.skeleton.given import given_poses, given_skeleton
 from tasks.values import Canonical, Motion, same
@@ -198,12 +197,3 @@ def test_another_process_with_other_threads_makes_the_same_bits() -> None:
         for n in ("1", "3")
     ]  # fmt: skip
     assert prints[0] == prints[1]
-
-
-@pytest.mark.parametrize(
-    ("key", "value"), [("subject", "dragon"), ("frames_per_clip", 3), ("vertices", 100), ("softness", -1.0)]
-)
-def test_settings_out_of_range_are_named(key: str, value: object) -> None:
-    settings = {"subject": "animal", "softness": 1.0, **SETTINGS, key: value}
-    with pytest.raises(InputError, match=f"dataset.{key}"):
-        load(**settings)

@@ -123,14 +123,6 @@ def test_open_surface_is_refused():
         skeleton(*shapes.box(open_top=True))
 
 
-@pytest.mark.parametrize(
-    ("name", "value"), [("speed", 0.0), ("edge", 0.5), ("angle", 10.0), ("rounds", 0), ("twig", -1.0)]
-)
-def test_settings_out_of_range_are_named(name, value):
-    with pytest.raises(InputError, match=rf"skeleton\.curve\.{name}"):
-        skeleton(*shapes.sphere(1), **{name: value})
-
-
 def test_pole_of_a_sphere_is_its_centre():
     vertices, faces = shapes.sphere(3)
     poles = flow.medial_poles(vertices, faces)

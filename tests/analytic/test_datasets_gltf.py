@@ -297,8 +297,6 @@ def test_damaged_containers(tmp_path):
     ):
         with pytest.raises(InputError, match=says):
             load(data, tmp_path)
-    with pytest.raises(InputError, match=r"dataset\.fps"):
-        load(whole, tmp_path, fps=0.0)
     (tmp_path / "folder.glb").mkdir()
     with pytest.raises(InputError, match="a folder"):
         rigged_character.load(path=str(tmp_path / "folder.glb"), fps=24.0, hierarchy="attached", unit="unit")

@@ -127,9 +127,6 @@ def test_liveliness_by_hand():
         ([5, 5], "clips", ["Clip0"], 0.5, "found Clip0"),
         ([5, 5], "clips", ["clip0", "clip1"], 0.5, "left to train on"),
         ([5], "clips", [], 0.5, "set split.by=frames"),
-        ([5, 5], "clips", [], 0.0, "split.fraction"),
-        ([5, 5], "clips", [], 1.0, "split.fraction"),
-        ([5, 5], "frames", [], float("nan"), "split.fraction"),
         ([5, 5], "frames", [], 0.01, "expected test frames, found zero"),
         ([5, 5], "frames", [], 0.99, "expected training frames, found zero"),
         ([5, 5], "frames", ["clip0"], 0.5, "split.by=frames"),
@@ -179,8 +176,6 @@ def test_observed_keeps_the_first_training_frames_and_the_whole_test():
     assert train.clip_names == ("clip0", "clip2")
     np.testing.assert_array_equal(train.points, motion.points[[*range(6), 11, 12]])
     assert test.frames == 5
-    with pytest.raises(InputError, match=r"split\.observed"):
-        split(motion, by="clips", test=["clip1"], fraction=0.5, observed=0.0, frames=None)
 
 
 @pytest.mark.parametrize("frames", [2, 24, 60, 61, 99, 130])
@@ -193,5 +188,5 @@ def test_fewer_frames_come_in_stretches_from_clips_far_apart(frames):
     for name, clip in zip(train.clip_names, train.clips(), strict=True):
         source = motion.clips()[motion.clip_names.index(name)]
         np.testing.assert_array_equal(train.points[clip], motion.points[source][: clip.stop - clip.start])
-    with pytest.raises(InputError, match=r"split\.frames.*2 to the 140"):
+    with pytest.raises(InputError, match=r"split\.frames.*at most the 140"):
         split(motion, by="clips", test=["clip4"], fraction=0.5, observed=1.0, frames=141)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from tasks.errors import InputError
 from tasks.geometry import kinematics, rigid
 from tasks.geometry.measure import vertex_rmse
 from tasks.geometry.rotations import from_rotation_vector, geodesic
@@ -219,11 +218,6 @@ def test_joints_outside_are_taken_inside():
     moved = keep_inside(np.array([[1.0, 0.5, 0.0], [0.5, 0.01, 0.0]]), shape.surface, shape.curve)
     assert np.linalg.norm(moved[0, 1:]) < 0.15
     assert moved[1].tolist() == [0.5, 0.01, 0.0]
-
-
-def test_a_setting_out_of_range_is_named():
-    with pytest.raises(InputError, match=r"skeleton\.motion\.max_joints"):
-        find(ball_joint(), max_joints=0)
 
 
 def test_centres_of_planted_pairs_with_noise_in_the_guess():

@@ -247,20 +247,12 @@ def test_bad_poses_are_refused(train, method):
 @pytest.mark.parametrize(
     ("change", "where"),
     [
-        ({"k": 0}, "animate.k"),
-        ({"patch": 0}, "animate.patch"),
         ({"patch": 81}, "animate.patch"),
-        ({"levels": 0}, "animate.levels"),
-        ({"lambda_": 0.0}, "animate.lambda"),
-        ({"temperature": 0.0}, "animate.temperature"),
-        ({"represent": "world"}, "animate.represent"),
-        ({"dynamics": -1.0}, "animate.dynamics"),
         ({"shrink": True}, "animate.shrink"),
         ({"represent": "residual", "shrink": True, "sources": 9}, "animate.shrink"),
-        ({"sources": -1}, "animate.sources"),
     ],
 )
-def test_bad_settings_are_refused(train, change, where):
+def test_settings_that_exclude_each_other_are_refused(train, change, where):
     with pytest.raises(InputError, match=where):
         partmm.animate(train, planted.poses([A]), **PAPER | change)
 

@@ -134,10 +134,3 @@ def test_named_part_without_bones_is_an_error():
     named = ["hand=hand_l", "body=" + ",".join(rest)]
     with pytest.raises(InputError, match="none in 'hand'"):
         find_parts(tree, no_hand, kind="named", named=named, overlap=1, affinity=0.3)
-
-
-@pytest.mark.parametrize(("overlap", "affinity"), [(-1, 0.1), (1, 1.0), (1, -0.1)])
-def test_settings_out_of_range(overlap, affinity):
-    tree, _ = planted.skeleton()
-    with pytest.raises(InputError, match="parts"):
-        find_parts(tree, skinned(tree), kind="auto", named=[], overlap=overlap, affinity=affinity)

@@ -199,7 +199,6 @@ def test_frames_are_chosen_first_evenly_or_by_interpolation():
     ("change", "words"),
     [
         ({"clip": "three"}, ["scene.clip", "one, two"]),
-        ({"frames": 1}, ["scene.frames", "2 or more"]),
         ({"frames": 20, "choose": "resample"}, ["scene.choose", "without a skeleton"]),
     ],
 )
@@ -208,14 +207,6 @@ def test_wrong_frames_are_one_line(change, words):
     with pytest.raises(InputError) as error:
         scene_motion(ball(rig=True), **settings)
     assert all(word in str(error.value) for word in words)
-
-
-@pytest.mark.parametrize(
-    "change", [{"size": 0}, {"fill": 0.0}, {"fill": 1.0}, {"views": 0}, {"samples": 0}, {"shading": 2.0}]
-)
-def test_wrong_settings_are_one_line(change):
-    with pytest.raises(InputError, match=f"scene.{next(iter(change))}"):
-        render_scene(ball(), **SCENE | change)
 
 
 def test_bare_points_cannot_be_rendered():

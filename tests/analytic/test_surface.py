@@ -147,9 +147,3 @@ def test_flat_shape_is_refused(faces):
     flat = np.random.default_rng(0).random((100, 3)) * [1.0, 1.0, 0.0]
     with pytest.raises(InputError, match="span a volume"):
         close(flat, faces)
-
-
-@pytest.mark.parametrize(("name", "value"), [("vertices", 3), ("cells", 2), ("neighbours", 1)])
-def test_settings_out_of_range_are_named(name, value):
-    with pytest.raises(InputError, match=rf"skeleton\.surface\.{name}"):
-        close(*shapes.box(), **{name: value})

@@ -9,7 +9,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from flows import config, schema
+from flows import config, ranges, schema
 from flows.source import ROOT
 from tasks.errors import InputError
 
@@ -72,7 +72,11 @@ def one_line(error: InputError) -> str:
         (["bones"], ["bones", "KEY=VALUE"]),
         (["seed=-1"], ["seed", "0 or more", "-1"]),
         (["sweep.seeds=[0,-2]"], ["sweep.seeds", "0 or more", "-2"]),
-        (["memory.max_gb=0"], ["memory.max_gb", "above zero"]),
+        (["memory.max_gb=0"], ["memory.max_gb", "a finite number, above 0", "found 0"]),
+        (["animate.k=0"], ["animate.k", "a whole number, 1 or more", "found 0"]),
+        (["method=mlp", "animate.rate=-1"], ["animate.rate", "above 0", "found -1"]),
+        (["split.observed=1.5"], ["split.observed", "above 0 and at most 1", "found 1.5"]),
+        (["runner.workers=0"], ["runner.workers", "1 or more"]),
         (["report.name=../other"], ["report.name", "../other", "report.path"]),
         (["bones.max_bones="], ["bones.max_bones"]),
         (["bones.max_bones=1,2"], ["bones.max_bones", "add -m"]),
@@ -195,6 +199,29 @@ def test_a_whole_number_may_stand_for_a_number_and_nothing_else_is_converted():
     for wrong in ({"a": True}, {"a": "1"}, {"b": 1.5}, {"c": [[1]]}):
         with pytest.raises(InputError):
             schema.check({"a": 1, "b": 2, "c": []} | wrong, expected)
+
+
+@pytest.mark.parametrize(
+    ("text", "inside", "outside", "words"),
+    [
+        ("[1, inf)", [1, 1e30], [0, 0.999], "1 or more"),
+        ("(0, inf)", [1e-30], [0, -1], "above 0"),
+        ("[0, 1)", [0, 0.999], [1, -1e-9], "0 or more and below 1"),
+        ("(-inf, 2.5]", [-1e30, 2.5], [2.6], "at most 2.5"),
+        ("[1e-4, 0.1]", [1e-4, 0.1], [0, 0.2, float("nan")], "0.0001 to 0.1"),
+    ],
+)
+def test_intervals(text, inside, outside, words):
+    span = ranges.Interval.of(text)
+    assert all(number in span for number in inside)
+    assert not any(number in span for number in outside)
+    assert str(span) == words
+
+
+@pytest.mark.parametrize("text", ["0..1", "[1, 0]", "[1, 1)", "1 or more", "[0 1]"])
+def test_what_is_no_interval_is_a_defect_of_ours(text):
+    with pytest.raises(ValueError, match="interval"):
+        ranges.Interval.of(text)
 
 
 def command(*arguments: str) -> subprocess.CompletedProcess:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import functools
 import io
+import math
 import typing
-from functools import cache
 
+import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from flows import config, run, schema
+from flows import config, ranges, run, schema
 from tasks.errors import InputError
 
 HARDLY = {"deadline": None, "derandomize": True, "suppress_health_check": list(HealthCheck)}
@@ -22,7 +24,7 @@ PLAIN = st.one_of(
 VALUES = st.recursive(PLAIN, lambda inner: st.lists(inner, max_size=3) | st.dictionaries(WORDS, inner, max_size=3))
 
 
-@cache
+@functools.cache
 def composed() -> dict:
     """The default config of one case."""
     return config.expand(["sweep.datasets=null", "sweep.methods=null"])[0].config
@@ -67,6 +69,8 @@ def odd(kind: object) -> st.SearchStrategy:
         return st.lists(odd(typing.get_args(kind)[0]), max_size=2)
     numbers = st.sampled_from([0, -1, 1, 2**63, -(2**64), 10**30, 10**400, 0.0, -0.5, 1e-320, 1e31, -1e308])
     beyond = st.sampled_from([float("nan"), float("inf"), float("-inf")])
+    if typing.get_origin(kind) is typing.Annotated:
+        return st.one_of(odd(kind.__origin__), st.sampled_from(outside(kind)))
     return {int: numbers | beyond, float: numbers | beyond, str: WORDS, bool: st.booleans()}.get(kind, st.none())
 
 
@@ -93,6 +97,55 @@ def test_no_stage_is_given_a_number_that_is_none(data):
     with contextlib.suppress(InputError):
         taken = schema.check(changed, schema.schema(changed, config.SWEEP))
     assert finite(taken)
+
+
+def outside(kind: object) -> list[object]:
+    """Values of the right type just beyond what a type allows; none where it allows all."""
+    if typing.get_origin(kind) in schema.UNIONS:
+        return [value for member in typing.get_args(kind) for value in outside(member)]
+    if typing.get_origin(kind) is list:
+        return [[value] for value in outside(typing.get_args(kind)[0])]
+    if typing.get_origin(kind) is not typing.Annotated:
+        return []
+    span, step = ranges.Interval.of(kind.__metadata__[0]), 1 if kind.__origin__ is int else 1e-9
+    below = [] if span.low == -math.inf else [span.low - step if span.with_low else span.low]
+    above = [] if span.high == math.inf else [span.high + step if span.with_high else span.high]
+    return [kind.__origin__(value) for value in below + above]
+
+
+COMPOSED = {
+    "quick": ["sweep.datasets=null", "sweep.methods=null"],
+    **{f"method {name}": ["sweep.datasets=null", f"method={name}"] for name in ("mlp", "part_kernel", "bone_response")},
+    "images": ["sweep.datasets=null", "dataset=scene_figure", "method=gaussians", "reconstruction=cpu"],
+    "garments": ["+experiment=make_garments", "sweep.datasets=[garments_dress]"],
+    **{f"benchmark {name}": [f"+experiment={name}"] for name in ("benchmark_matching", "benchmark_rasterizer")},
+}
+
+
+@pytest.mark.parametrize("overrides", COMPOSED.values(), ids=COMPOSED)
+def test_every_range_is_refused_before_anything_is_computed(overrides):
+    whole = config.expand([*overrides, "sweep.methods=null"])[0].config
+    expected, tried = schema.schema(whole, config.SWEEP), 0
+    for path in (p for p in places(whole) if known(expected, p)):
+        for value in outside(leaf(expected, path)):
+            changed = copy.deepcopy(whole)
+            *groups, name = path
+            functools.reduce(dict.__getitem__, groups, changed)[name] = value
+            with pytest.raises(InputError) as caught:
+                schema.check(changed, expected)
+            said = str(caught.value)
+            assert said.startswith(".".join(path)), said
+            assert "\n" not in said
+            tried += 1
+    assert tried > 10
+
+
+def known(expected: object, path: tuple[str, ...]) -> bool:
+    """Whether the schema has a type for this path (lists of a config have none for their entries)."""
+    try:
+        return leaf(expected, path) is not None
+    except (KeyError, TypeError):
+        return False
 
 
 def leaf(expected: object, path: tuple[str, ...]) -> object:

@@ -118,7 +118,6 @@ def test_images_are_brought_down_with_their_intrinsics_and_without_dark_rims(tmp
     part = (train.images[0, ..., 3] > 0) & (train.images[0, ..., 3] < 255)
     assert part.any()
     assert (train.images[0][part][:, 0] == 255).all()
-    refused(lambda: load(tmp_path, size=0), "dataset.size", "1 pixel or more")
 
 
 def test_images_smaller_than_the_size_asked_for_stay_as_they_are(tmp_path):

@@ -21,21 +21,31 @@ def losses(paths: Trajectories, bones: Forms, index: np.ndarray, value: np.ndarr
 
     def work(start: int, stop: int) -> None:
         length, frames = paths.lengths, paths.frames
-        _losses(paths.rest, paths.path, length, frames, bones.linear, bones.square, index, value, loss, start, stop)
+        _losses(
+            paths.rest,
+            paths.path,
+            length,
+            frames,
+            bones.linear,
+            bones.square,
+            bones.own,
+            index,
+            value,
+            loss,
+            start,
+            stop,
+        )
 
     for_chunks(work, len(index), POINTS)
     return np.bincount(np.maximum(index, 0).ravel(), loss.ravel(), minlength=len(bones.square))
 
 
 @njit(cache=True, nogil=True)
-def _losses(rest, path, length, frames, linear, square, index, value, loss, start, stop):
+def _losses(rest, path, length, frames, linear, square, own, index, value, loss, start, stop):
     count, slots = len(square), index.shape[1]
     raw, correlation = np.empty((TILE, 4 * count)), np.empty((TILE, count))
     hh = np.empty(10)
-    diagonal, reach = np.empty((10, count)), np.empty(count)
-    for b in range(count):
-        for k in range(10):
-            diagonal[k, b] = square[b, k, b]
+    reach = np.empty(count)
     bones, w = np.empty(slots + 1, np.int64), np.empty(slots + 1)
     q = np.empty((slots + 1, slots + 1))
     for low in range(start, stop, TILE):
@@ -58,7 +68,7 @@ def _losses(rest, path, length, frames, linear, square, index, value, loss, star
                         size += 1
                 banned = -1 if loss_of_all else index[n, out]
                 if size == 0 or total <= 0.0:
-                    bones[0] = _best_alone(diagonal, hh, c, e, banned)
+                    bones[0] = _best_alone(own, hh, c, e, banned)
                     w[0], size, total = 1.0, 1, 1.0
                 for s in range(size):
                     w[s] /= total
@@ -68,21 +78,21 @@ def _losses(rest, path, length, frames, linear, square, index, value, loss, star
                 if loss_of_all:
                     whole = now
                     continue
-                found = best_bone(square, diagonal, hh, c, e, 0.0, bones, w, size, now, reach, banned)
+                found = best_bone(square, own, hh, c, e, 0.0, bones, w, size, now, reach, banned)
                 if found >= 0:
                     size, now = bring_in(square, hh, c, e, 0.0, bones, w, size, slots, now, q, found)
                 loss[n, out] = max(now - whole, 0.0)
 
 
 @njit(cache=True, nogil=True)
-def _best_alone(diagonal, hh, c, e, banned):
+def _best_alone(own, hh, c, e, banned):
     best, least = 0, np.inf
-    for b in range(diagonal.shape[1]):
+    for b in range(own.shape[1]):
         if b == banned:
             continue
         total = e - 2.0 * c[b]
         for k in range(10):
-            total += hh[k] * diagonal[k, b]
+            total += hh[k] * own[k, b]
         if total < least:
             best, least = b, total
     return best

@@ -34,12 +34,13 @@ class Forms:
 
     rows: (B, 4, P), <D_b h, u> = sum_ip h_i rows[b, i, p] path_p, a mean over frames like all that follows; linear:
     (P, 4 B), the same laid out for all bones at once, column i B + b; square: (B, 10, B), h^T D_b^T D_c h =
-    sum_k square[b, k, c] (h h^T)_k, upper triangle row by row.
+    sum_k square[b, k, c] (h h^T)_k, upper triangle row by row; own: (10, B), square[b, :, b] with the bones innermost.
     """
 
     rows: np.ndarray
     linear: np.ndarray
     square: np.ndarray
+    own: np.ndarray
 
 
 def forms(paths: Trajectories, offsets: np.ndarray) -> Forms:
@@ -51,7 +52,8 @@ def forms(paths: Trajectories, offsets: np.ndarray) -> Forms:
     for k, (i, j) in enumerate(_PAIRS):
         square[:, k] = gram[:, i, :, j] if i == j else gram[:, i, :, j] + gram[:, j, :, i]
     rows = _rows(paths, offsets)
-    return Forms(rows, _side_by_side(rows), square)
+    own = np.ascontiguousarray(np.einsum("bkb->kb", square))
+    return Forms(rows, _side_by_side(rows), square, own)
 
 
 def _rows(paths: Trajectories, offsets: np.ndarray) -> np.ndarray:
@@ -111,6 +113,7 @@ def exchange(
             bones.rows,
             bones.linear,
             bones.square,
+            bones.own,
             index,
             value,
             error,
@@ -204,6 +207,7 @@ def _exchange(
     rows,
     linear,
     square,
+    own,
     index,
     value,
     error,
@@ -219,10 +223,7 @@ def _exchange(
     count, slots = len(square), index.shape[1]
     raw, correlation = np.empty((TILE, 4 * count)), np.empty((TILE, count))
     hh = np.empty(10)
-    diagonal, reach = np.empty((10, count)), np.empty(count)
-    for b in range(count):
-        for k in range(10):
-            diagonal[k, b] = square[b, k, b]
+    reach = np.empty(count)
     bones, w = np.empty(slots + 1, np.int64), np.empty(slots + 1)
     q = np.empty((slots + 1, slots + 1))
     for low in range(start, stop, TILE):
@@ -249,7 +250,7 @@ def _exchange(
             size = solve(q, bones, w, size)
             now = value_of(q, w, size)
             for _ in range(rounds):
-                found = best_bone(square, diagonal, hh, c, e, smoothness, bones, w, size, now, reach, -1)
+                found = best_bone(square, own, hh, c, e, smoothness, bones, w, size, now, reach, -1)
                 if found < 0:
                     break
                 before = now
@@ -285,7 +286,7 @@ def quadratic_form(square, hh, c, e, smoothness, bones, size, q):
 
 
 @njit(cache=True, nogil=True)
-def best_bone(square, diagonal, hh, c, e, smoothness, bones, w, size, now, reach, banned):
+def best_bone(square, own, hh, c, e, smoothness, bones, w, size, now, reach, banned):
     """The bone outside the support, and not banned, towards which w^T Q w falls most along a line, or -1."""
     count = len(square)
     shift = e
@@ -303,11 +304,11 @@ def best_bone(square, diagonal, hh, c, e, smoothness, bones, w, size, now, reach
         along = reach[b] + shift - c[b]  # <r, d_b>
         if along >= now or b == banned:
             continue
-        own = e - 2.0 * c[b] + smoothness
+        alone = e - 2.0 * c[b] + smoothness
         for k in range(10):
-            own += hh[k] * diagonal[k, b]
+            alone += hh[k] * own[k, b]
         gap = now - along
-        gain = gap * gap / max(now - 2.0 * along + own, gap)  # the step stops at w_b = 1
+        gain = gap * gap / max(now - 2.0 * along + alone, gap)  # the step stops at w_b = 1
         if gain > most:
             inside = False
             for s in range(size):

@@ -117,15 +117,24 @@ def strongest(sources: Sources, k: int) -> np.ndarray:
     return np.take_along_axis(sources.frame, order, 1)
 
 
-def blend(sources: Sources, values: np.ndarray, query: PartMotion, training: PartMotion, *, align: bool) -> np.ndarray:
-    """Weighted mean of the sources' bones, each aligned to the query first.
+def blend(
+    sources: Sources,
+    values: np.ndarray,
+    which: np.ndarray,
+    query: PartMotion | None = None,
+    training: PartMotion | None = None,
+) -> np.ndarray:
+    """Weighted mean of the sources' bones, where motions are given each aligned to the query first.
 
-    values: (F, B, 3, 4) training bones as frames -> (T, B, 3, 4) float64; the linear part is a mean of rotations, to be
-    projected to SO(3) once the parts are merged.
-    align: turn each source by the rotation that brings its joints closest to the query's, project(sum_j R_query,j
-    R_source,j^T) (eq. 9), about the part's anchor, and carry it to the query's anchor.
+    values: (F, B, 3, 4) training bones as frames; which: (M,) of the B -> (T, M, 3, 4) float64; the linear part is a
+    mean of rotations, to be projected to SO(3) once the parts are merged.
+    query, training: turn each source by the rotation that brings its joints closest to the query's, project(sum_j
+    R_query,j R_source,j^T) (eq. 9), about the part's anchor, and carry it to the query's anchor.
     """
-    out = np.zeros((len(sources.frame), *values.shape[1:]))
+    out = np.zeros((len(sources.frame), len(which), 3, 4))
+    align = query is not None and training is not None
+    if not align:
+        query = training = PartMotion(np.zeros((len(out), 0, 4)), np.zeros((len(out), 3)))
 
     def work(a: int, b: int) -> None:
         _blend(
@@ -133,6 +142,7 @@ def blend(sources: Sources, values: np.ndarray, query: PartMotion, training: Par
             sources.share[a:b],
             sources.count[a:b],
             values,
+            which,
             query.joints[a:b],
             training.joints,
             query.anchor[a:b],
@@ -146,7 +156,7 @@ def blend(sources: Sources, values: np.ndarray, query: PartMotion, training: Par
 
 
 @njit(cache=True, nogil=True)
-def _blend(frame, share, count, values, joints, keys, anchor, key_anchor, align, out):
+def _blend(frame, share, count, values, which, joints, keys, anchor, key_anchor, align, out):
     turn, shift = np.eye(3), np.zeros(3)
     for t in range(len(frame)):
         for m in range(count[t]):
@@ -157,9 +167,10 @@ def _blend(frame, share, count, values, joints, keys, anchor, key_anchor, align,
                     shift[r] = anchor[t, r]
                     for c in range(3):
                         shift[r] -= turn[r, c] * key_anchor[g, c]
-            for b in range(values.shape[1]):
+            for b in range(len(which)):
+                value = values[g, which[b]]
                 for r in range(3):
                     x, y, z = w * turn[r, 0], w * turn[r, 1], w * turn[r, 2]
                     for c in range(4):
-                        out[t, b, r, c] += x * values[g, b, 0, c] + y * values[g, b, 1, c] + z * values[g, b, 2, c]
+                        out[t, b, r, c] += x * value[0, c] + y * value[1, c] + z * value[2, c]
                     out[t, b, r, 3] += w * shift[r]

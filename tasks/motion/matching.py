@@ -58,13 +58,15 @@ class Matched:
 @dataclass(frozen=True)
 class PartStore:
     """What a part's blend takes from the database. follows: (M,) its bones; affinity: (M,) how much they follow;
-    values: (F, M, 3, 4) in the part's frame; motion: its joints in the training frames; heavy: (J,) what its joints
-    say of its bones; space: where poses are compared for their shares, or None for a softmax."""
+    values: (F, B or M, 3, 4) in the part's frame, of which it takes ``which``: (M,); motion: its joints in the training
+    frames, where sources are aligned; heavy: (J,) what its joints say of its bones; space: where poses are compared for
+    their shares, or None for a softmax."""
 
     follows: np.ndarray
     affinity: np.ndarray
     values: np.ndarray
-    motion: PartMotion
+    which: np.ndarray
+    motion: PartMotion | None
     heavy: np.ndarray
     space: Space | None
 
@@ -93,14 +95,17 @@ def prepare(training: Training, way: Way) -> Prepared:
         expected = f"at most the {longest} frames of the longest training clip"
         raise InputError("animate.patch", expected=expected, found=str(way.patch))
     values = known.encode(training.database.bones, way.represent)
+    align = way.align and way.represent != "residual"
     parts = []
     for part, affinity in enumerate(training.parts.affinity):
         follows = np.flatnonzero(affinity > 0)
-        mine = known.to_part(values[:, follows], part, way.represent)
+        own = way.represent == "part"
+        mine = known.to_part(values[:, follows], part, way.represent) if own else values
+        which = np.arange(len(follows)) if own else follows
         heavy = joint_weights(known, part, known.key_joints(part))
         told = space(known.keys(part, way.dynamics), heavy) if way.sources else None
-        moving = known.part_motion(part, way.represent)
-        parts.append(PartStore(follows, affinity[follows], mine, moving, heavy, told))
+        moving = known.part_motion(part, way.represent) if align else None
+        parts.append(PartStore(follows, affinity[follows], mine, which, moving, heavy, told))
     ready = Prepared(known, way, tuple(parts), frames)
     return replace(ready, keep=_reliability(ready, values)) if way.shrink else ready
 
@@ -137,9 +142,8 @@ def _match_clip(asked: Posed, ready: Prepared, skip: tuple[int, ...] = ()) -> tu
         keys = asked.keys(part, way.dynamics), known.keys(part, way.dynamics)
         found = nearest_windows(*keys, k=way.k, patch=way.patch, strides=strides, skip=skip)
         if way.sources:
-            store = ready.parts[part]
-            told = describe(keys[0], store.heavy) @ store.space.basis
-            rows.append(nearest_moments(told, store.space, way.sources))
+            known_moments = ready.parts[part].space
+            rows.append(nearest_moments(describe(keys[0], known_moments), known_moments, way.sources))
         else:
             rows.append(gather(found, strides, patch=way.patch, lambda_=way.lambda_, temperature=way.temperature))
         distance.append(_per_frame(found.distance[-1, :, 0], frames, way.patch))
@@ -150,10 +154,10 @@ def _match_clip(asked: Posed, ready: Prepared, skip: tuple[int, ...] = ()) -> tu
 def merged(asked: Posed, ready: Prepared, rows: list[Sources]) -> np.ndarray:
     """Every part's blend of its sources, (F, B, 3, 4): parts averaged by affinity, projected to rigid frames once."""
     represent = ready.way.represent
-    align = ready.way.align and represent != "residual"
     bones = np.zeros((len(asked.world), len(asked.centres), 3, 4))
     for part, (row, store) in enumerate(zip(rows, ready.parts, strict=True)):
-        mixed = blend(row, store.values, asked.part_motion(part, represent), store.motion, align=align)
+        moving = None if store.motion is None else asked.part_motion(part, represent)
+        mixed = blend(row, store.values, store.which, moving, store.motion)
         placed = asked.from_part(mixed, part, represent)
         bones[:, store.follows] += store.affinity[:, None, None] * placed
     return rigid.make(project(bones[..., :3]), bones[..., 3])

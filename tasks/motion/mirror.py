@@ -13,7 +13,9 @@ from scipy.spatial import cKDTree
 
 from tasks.geometry import rigid
 from tasks.geometry.measure import diagonal
-from tasks.motion.posed import centroids
+from tasks.geometry.parallel import for_chunks
+from tasks.motion.frames import placed
+from tasks.motion.posed import FRAME_CHUNK, centroids
 from tasks.motion.projection import project
 from tasks.values import Poses, Training
 
@@ -91,9 +93,16 @@ def _mirrored_bones(training: Training, flip: np.ndarray, at: np.ndarray) -> np.
     image = np.einsum("nk,nkb->nb", near_weight, weights[near.reshape(len(rest), -1)])
     share = weights.T @ image
     share /= np.maximum(share.sum(1, keepdims=True), 1e-12)
-    bones = training.database.bones.astype(np.float64)
-    blended = (share @ bones.reshape(len(bones), -1, 12)).reshape(bones.shape)
+    bones = training.database.bones
     centres = centroids(training.skinning.rest, training.skinning.weights)
-    place = _reflect(rigid.apply(blended, _reflect(centres, axis, at)), axis, at)
-    rotation = project(flip @ blended[..., :3] @ flip)
-    return rigid.make(rotation, place - (rotation @ centres[..., None])[..., 0]).astype(np.float32)
+    image_centres, out = _reflect(centres, axis, at), np.empty(bones.shape, np.float32)
+
+    def work(a: int, b: int) -> None:
+        blended = (share @ bones[a:b].reshape(b - a, -1, 12).astype(np.float64)).reshape(b - a, -1, 3, 4)
+        placed(blended, image_centres, blended)
+        place = _reflect(blended[..., 3], axis, at)
+        rotation = project(np.diag(flip)[:, None] * blended[..., :3] * np.diag(flip))
+        out[a:b] = rigid.make(rotation, place - (rotation @ centres[..., None])[..., 0])
+
+    for_chunks(work, len(bones), FRAME_CHUNK)
+    return out

@@ -104,10 +104,10 @@ class Online:
 
     def _moments(self, part: int, known: Space) -> Sources:
         """The moments nearest to the latest pose and its past."""
-        joints, heavy = self._ready.known.key_joints(part), self._ready.parts[part].heavy
+        joints = self._ready.known.key_joints(part)
         turns, moving = (np.stack(x) for x in zip(*self._keys, strict=True))
-        told = describe(Keys(turns[:, joints], moving, np.array([0, len(turns)])), heavy)[-1:]
-        return nearest_moments(told @ known.basis, known, self._ready.way.sources)
+        told = describe(Keys(turns[:, joints], moving, np.array([0, len(turns)])), known)[-1:]
+        return nearest_moments(told, known, self._ready.way.sources)
 
     def _moving(self) -> np.ndarray:
         """The root's dynamics some frames ago, (E, 3), as the delayed keys of the database hold them."""

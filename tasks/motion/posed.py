@@ -8,9 +8,11 @@ import numpy as np
 
 from tasks.geometry import kinematics, rigid
 from tasks.geometry.measure import diagonal
+from tasks.geometry.parallel import for_chunks
 from tasks.geometry.rotations import to_quaternion
 from tasks.motion.blending import PartMotion
 from tasks.motion.dynamics import root_dynamics
+from tasks.motion.frames import placed, seen_from
 from tasks.motion.parts import bone_affinity
 from tasks.motion.projection import project
 from tasks.motion.search import Keys
@@ -21,11 +23,13 @@ from tasks.values import Poses, Training
 # clothing (0.3, 0.1 per m/s, 0.1 per g, 0.03 per rad/s) for a body whose bounding box has a diagonal of two metres.
 DYNAMICS = np.array([0.3, 0.2, 0.02, 0.03])
 
+FRAME_CHUNK = 128  # frames at once, which stay in the processor's cache
+
 
 class Posed:
     """Training poses, or those of a query. Transforms are float64.
 
-    world: (F, J, 3, 4) of the joints on canonical points; model: the same seen from the model's root joint;
+    world: (F, J, 3, 4) of the joints on canonical points;
     bones are handled as frames, [R | position of the bone's centroid], unrotated at rest. Blending positions of
     centroids, instead of translations of canonical points, keeps a bone where its sources have it even when their
     rotations differ.
@@ -43,11 +47,15 @@ class Posed:
             poses.rotations.astype(np.float64),
             poses.translations.astype(np.float64),
         )
-        self.model = relative(self.world, self.world[:, self.root])
         self.centres = like.centres if like else centroids(training.skinning.rest, training.skinning.weights)
         if like:
             self.affinity = like.affinity
         self._keys: dict[tuple[int, float], Keys] = {}
+
+    @cached_property
+    def model(self) -> np.ndarray:
+        """(F, J, 3, 4) the joints seen from the model's root."""
+        return relative(self.world, self.world[:, self.root])
 
     @cached_property
     def quaternions(self) -> np.ndarray:
@@ -72,8 +80,15 @@ class Posed:
         """(F, B, 3, 4) where skinning of the skeleton would carry the bones' frames."""
         affinity = self.affinity
         frames, joints = self.world.shape[:2]
-        blended = (affinity @ self.world.reshape(frames, joints, 12)).reshape(frames, len(affinity), 3, 4)
-        return rigid.make(project(blended[..., :3]), rigid.apply(blended, self.centres))
+        out = np.empty((frames, len(affinity), 3, 4))
+
+        def work(a: int, b: int) -> None:
+            blended = (affinity @ self.world[a:b].reshape(b - a, joints, 12)).reshape(b - a, len(affinity), 3, 4)
+            placed(blended, self.centres, out[a:b])
+            out[a:b, :, :, :3] = project(out[a:b, :, :, :3])
+
+        for_chunks(work, frames, FRAME_CHUNK)
+        return out
 
     def key_joints(self, part: int) -> np.ndarray:
         """The part's joints below the model's root, which is left out: bones are stored relative to it. A part that
@@ -105,8 +120,8 @@ class Posed:
         root = int(self.training.parts.roots[part])
         joints = self.training.parts.joints[part] & self.inner
         turns = to_quaternion(self.to_part(self.model[:, joints], part, represent)[..., :3])
-        placed = self.to_part(self.model[:, root, None], part, represent)[:, 0]
-        return PartMotion(turns, rigid.apply(placed, self.training.skeleton.joints[root].astype(np.float64)))
+        root_at = self.to_part(self.model[:, root, None], part, represent)[:, 0]
+        return PartMotion(turns, rigid.apply(root_at, self.training.skeleton.joints[root].astype(np.float64)))
 
     def _part_root(self, part: int) -> np.ndarray:
         return self.model[:, int(self.training.parts.roots[part])]
@@ -114,11 +129,15 @@ class Posed:
     def encode(self, transforms: np.ndarray, represent: str) -> np.ndarray:
         """Transforms of bones on canonical points -> frames seen from the model's root or, as ``residual``, from where
         skinning would carry them. (F, B, 3, 4)."""
-        transforms = transforms.astype(np.float64)
-        frames = rigid.make(transforms[..., :3], rigid.apply(transforms, self.centres))
-        if represent == "residual":
-            return rigid.compose(rigid.inverse(self.predicted), frames)
-        return relative(frames, self.world[:, self.root])
+        base = self.predicted if represent == "residual" else self.world[:, self.root, None]
+        out = np.empty(transforms.shape)
+
+        def work(a: int, b: int) -> None:
+            placed(transforms[a:b].astype(np.float64), self.centres, out[a:b])
+            seen_from(base[a:b], out[a:b], out[a:b])
+
+        for_chunks(work, len(out), FRAME_CHUNK)
+        return out
 
     def decode(self, frames: np.ndarray, represent: str) -> np.ndarray:
         """The inverse of :meth:`encode`."""

@@ -10,7 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-SQUARINGS = 10  # the second eigenvalue's share falls to its 1024th power
+SQUARINGS = 10  # at most: the second eigenvalue's share falls to its 1024th power
+ALONE = 1e-9  # others' share before a squaring that leaves the principal part alone
 
 
 def project(matrices: np.ndarray) -> np.ndarray:
@@ -28,8 +29,11 @@ def _project(matrices, out):
         m = matrices[n]
         a, b, c, d, e, f = m[0, 0], m[0, 1], m[0, 2], m[1, 0], m[1, 1], m[1, 2]
         g, h, i = m[2, 0], m[2, 1], m[2, 2]
-        # Horn's matrix, shifted by a bound on its eigenvalues so that the largest is also the largest in size
-        shift = np.sqrt(3.0 * (a * a + b * b + c * c + d * d + e * e + f * f + g * g + h * h + i * i)) + 1e-30
+        # Horn's matrix, shifted so that the largest eigenvalue is also the largest in size. Of a matrix that does not
+        # reflect it is that already: there the shift is the one that leaves nothing else where m is a rotation
+        size = np.sqrt((a * a + b * b + c * c + d * d + e * e + f * f + g * g + h * h + i * i) / 3.0) + 1e-30
+        reflects = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) <= 0.0
+        shift = 3.0 * size if reflects else size
         s[0, 0], s[1, 1], s[2, 2], s[3, 3] = shift + a + e + i, shift + a - e - i, shift + e - a - i, shift + i - a - e
         s[0, 1] = s[1, 0] = h - f
         s[0, 2] = s[2, 0] = c - g
@@ -63,15 +67,17 @@ def mean_turn(a, b, out):
 
 @njit(cache=True, nogil=True)
 def _principal_rotation(s, out):
-    """Rotation of the principal eigenvector of the positive semi-definite s (4, 4), which is destroyed."""
+    """Rotation of the eigenvector of the symmetric s (4, 4) whose eigenvalue is the largest in size; s is destroyed."""
     square = np.empty((4, 4))
-    for _ in range(SQUARINGS):
+    for i in range(SQUARINGS):
         trace = s[0, 0] + s[1, 1] + s[2, 2] + s[3, 3]
         for r in range(4):
             for c in range(r, 4):
                 total = s[r, 0] * s[0, c] + s[r, 1] * s[1, c] + s[r, 2] * s[2, c] + s[r, 3] * s[3, c]
                 square[r, c] = square[c, r] = total / (trace * trace)
         s[:] = square
+        if i > 0 and 1.0 - (s[0, 0] + s[1, 1] + s[2, 2] + s[3, 3]) < ALONE:  # from then on no eigenvalue is negative
+            break
     best = 0
     for r in range(1, 4):
         if s[r, r] > s[best, best]:

@@ -7,7 +7,8 @@ import pytest
 
 from tasks.geometry.measure import vertex_rmse
 from tasks.methods import partmm
-from tasks.motion.affine import Space, nearest_moments
+from tasks.motion.affine import RIDGE, WIDTH, Space, nearest_moments
+from tasks.motion.kernel import matern, squared_distances
 from tests.analytic import planted
 from tests.analytic.test_methods import PAPER
 
@@ -21,7 +22,7 @@ def train():
 
 
 def on_a_line(at: list[float]) -> Space:
-    return Space(np.array(at)[:, None], np.eye(1), np.ones(1), 1.0)
+    return Space(np.array(at)[:, None], np.eye(1), np.ones(1))
 
 
 def test_shares_sum_to_one_and_a_source_takes_what_lies_on_it():
@@ -31,6 +32,23 @@ def test_shares_sum_to_one_and_a_source_takes_what_lies_on_it():
     assert found.frame[0].tolist() == [0, 1, 2]
     assert found.share[0].argmax() == 1
     assert found.share[0, 1] > 0.85
+
+
+def test_the_kernel_solves_the_kriging_system():
+    """Shares minimise the variance under Matern's kernel with a ridge, subject to a sum of one: the bordered system."""
+    rng = np.random.default_rng(0)
+    frames, asked = rng.normal(size=(60, 9)), rng.normal(size=(7, 9))
+    found = nearest_moments(asked, Space(frames, np.eye(9), np.ones(1)), 14)
+    far = squared_distances(asked, frames)
+    for row in range(len(asked)):
+        near = np.sort(np.argsort(far[row])[:14])
+        assert found.frame[row].tolist() == near.tolist()
+        system = np.ones((15, 15))
+        there = frames[near]
+        system[:14, :14] = matern(squared_distances(there, there) / WIDTH**2) + RIDGE * np.eye(14)
+        system[14, 14] = 0.0
+        want = np.linalg.solve(system, np.append(matern(far[row, near] / WIDTH**2), 1.0))[:14]
+        np.testing.assert_allclose(found.share[row], want, atol=1e-9)
 
 
 def test_ten_copies_of_a_moment_count_as_one():

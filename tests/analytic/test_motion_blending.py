@@ -48,7 +48,8 @@ def test_projection_is_the_nearest_rotation():
     blends = np.concatenate([turns + 0.3 * rng.normal(size=turns.shape), 1e-3 * turns, rng.normal(size=turns.shape)])
     clear = np.linalg.svd(blends, compute_uv=False)[:, 1] > 0.05 * np.linalg.norm(blends, axis=(1, 2))
     np.testing.assert_allclose(project(blends)[clear], project_so3(blends)[clear], atol=1e-6)
-    np.testing.assert_allclose(project(turns[0]), turns[0], atol=1e-12)
+    np.testing.assert_allclose(project(turns), turns, atol=1e-12)
+    np.testing.assert_allclose(project(turns + 1e-3 * blends[:50]), project_so3(turns + 1e-3 * blends[:50]), atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(project(np.zeros((1, 3, 3)))), 1)  # no answer: still a rotation
 
 
@@ -61,9 +62,9 @@ def test_alignment_turns_about_the_anchor_and_carries_it_along():
     got = blend(
         source,
         bones,
+        np.arange(2),
         PartMotion(to_quaternion(turn @ joints), moved[None]),
         PartMotion(to_quaternion(joints), anchor[None]),
-        align=True,
     )
     want = rigid.make(turn @ bones[0, :, :, :3], (bones[0, :, :, 3] - anchor) @ turn.T + moved)
     np.testing.assert_allclose(got[0], want, atol=1e-9)

@@ -294,6 +294,9 @@ def check_run(config: dict) -> dict:
     name = config["report"]["name"]
     if name in ("", ".", "..") or set(name) & set("/\\%&<>"):
         raise InputError("report.name", expected="the name of a folder", found=repr(name), do="set report.path instead")
+    for group in ("store", "report"):
+        if not config[group]["path"].strip():
+            raise InputError(f"{group}.path", expected="a folder", found=repr(config[group]["path"]))
     return config
 
 

@@ -49,7 +49,8 @@ def run_batch(batch: Batch, show: bool = True) -> Path:
     """
     config = batch.config
     Store(config["store"]["path"])  # a store or a place for reports that cannot be used is said before anything starts
-    check_place(Path(config["report"]["path"]).expanduser())
+    for name in (experiment.name for experiment in batch.experiments):
+        check_place(Path(config["report"]["path"]).expanduser() / name)
     with stoppable(), server() as ready:
         graph, works = work(batch.experiments, config["report"])
         ready()
@@ -65,7 +66,12 @@ def run_batch(batch: Batch, show: bool = True) -> Path:
 
 def check_place(folder: Path) -> None:
     """Raises InputError where no report can be written; makes nothing, for a run that fails is to leave no trace."""
-    there = next(p for p in (folder.absolute(), *folder.absolute().parents) if p.exists())
+    try:
+        there = next(p for p in (folder.absolute(), *folder.absolute().parents) if p.exists())
+    except OSError as error:  # a name that no disk takes
+        raise InputError(
+            "report.name", expected="a folder that can be written", found=error.strerror or str(error)
+        ) from None
     if not (there.is_dir() and os.access(there, os.W_OK | os.X_OK)):
         found = "no permission to write" if there.is_dir() else "a file"
         raise InputError("report.path", expected="a folder that can be written", found=f"{found}: {there}")

@@ -13,6 +13,7 @@ has it. Without `time` an image's time is its index over their number. `file_pat
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -75,7 +76,7 @@ def load(
             camera=camera,
             frame=np.searchsorted(times, half.times - 2 * SAME_TIME).astype(np.int32),
             times=times.astype(np.float32),
-            fps=float(half.meta.get("fps", fps)),
+            fps=float(fps if half.fps is None else half.fps),
             clip_start=np.array([0, len(times)], np.int64),
             clip_names=(folder.resolve().name,),
             unit=unit,
@@ -98,6 +99,9 @@ class _Half:
             raise InputError(f"{self.file}: time", expected="numbers", found=str(given)[:80])
         self.times = validate.times_in_range(str(self.file), np.array(given, np.float64))
         self.view = np.stack([world_to_camera(self._matrix(i, f), world) for i, f in enumerate(frames)])
+        self.fps = self.meta.get("fps")
+        if not isinstance(self.fps, int | float | None):
+            raise InputError(f"{self.file}: fps", expected="a number", found=repr(self.fps)[:80])
         self._read(folder, frames, size)
 
     def _matrix(self, i: int, frame: dict) -> np.ndarray:
@@ -112,9 +116,10 @@ class _Half:
 
     def _read(self, folder: Path, frames: list[dict], size: int | None) -> None:
         files = [folder / (f"{p}.png" if not Path(p).suffix else p) for p in (str(f.get("file_path")) for f in frames)]
-        missing = [f for f in files if not f.is_file()]
+        missing = [f for f in files if not os.path.isfile(f)]  # a path's own is_file raises for names too long
         if missing:
-            found = f"no {missing[0].relative_to(folder)} ({len(missing)} of {len(files)} files are missing)"
+            first = str(missing[0]).removeprefix(f"{folder}{os.sep}")[:200]
+            found = f"no {first} ({len(missing)} of {len(files)} files are missing)"
             raise InputError(str(self.file), expected="the images that it names", found=found, do="add them")
         self.images, self.alpha, (height, width) = read_stack(files, size)
         k = self._intrinsics(height, width)
@@ -123,10 +128,12 @@ class _Half:
 
     def _intrinsics(self, height: int, width: int) -> np.ndarray:
         meta = {n: self.meta[n] for n in ("camera_angle_x", "fl_x", "fl_y", "cx", "cy") if n in self.meta}
-        bad = [n for n, v in meta.items() if not isinstance(v, int | float) or not 0 < v < 1e6]
+        most = {"camera_angle_x": np.pi}  # more are degrees
+        bad = [n for n, v in meta.items() if not isinstance(v, int | float) or not 0 < v < most.get(n, 1e6)]
         if bad or not {"camera_angle_x", "fl_x"} & set(meta):
             found = f"{bad[0]} = {meta[bad[0]]}" if bad else "neither camera_angle_x nor fl_x"
-            raise InputError(str(self.file), expected="camera_angle_x in radians", found=found)
+            expected = f"{bad[0]} in pixels" if bad and bad[0] != "camera_angle_x" else "camera_angle_x in radians"
+            raise InputError(str(self.file), expected=expected, found=found)
         fx = meta.get("fl_x") or width / 2 / np.tan(meta["camera_angle_x"] / 2)
         fy, cx, cy = meta.get("fl_y", fx), meta.get("cx", width / 2), meta.get("cy", height / 2)
         return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])

@@ -106,8 +106,8 @@ def read_json(file: Path) -> dict:
     if not file.is_file():
         raise InputError(str(file), expected="a JSON file", found="no such file", do="check dataset.path")
     try:
-        content = json.loads(file.read_text("utf-8"))
-    except (ValueError, UnicodeDecodeError) as error:
+        content = json.loads(file.read_text("utf-8-sig"))
+    except (ValueError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(str(file), expected="JSON", found=" ".join(str(error).split())[:120]) from None
     if not isinstance(content, dict):
         raise InputError(str(file), expected="a JSON object", found=type(content).__name__)

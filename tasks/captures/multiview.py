@@ -44,6 +44,7 @@ from tasks.geometry.rotations import from_rotation_vector
 from tasks.values import Capture, Rig
 
 IMAGES = (".png", ".jpg", ".jpeg")
+NOT_TURNED = 1e-3  # of a matrix's entries: rotations of float32 lie far below
 UNREADABLE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
 
 
@@ -208,15 +209,19 @@ def _unit(folder: Path, meta: dict) -> str:
 
 def _rig(file: Path, frames: int) -> Rig:
     data = _arrays(file)
-    joints = len(data["names"])
-    if data["rotations"].ndim == 3:
-        data["rotations"] = from_rotation_vector(data["rotations"].astype(np.float64))
-    shapes = {"parents": (joints,), "joints": (joints, 3), "rotations": (frames, joints, 3, 3)}
+    joints = data["names"].size
+    turns = (frames, joints, 3, 3) if data["rotations"].ndim == 4 else (frames, joints, 3)
+    shapes = {"parents": (joints,), "joints": (joints, 3), "rotations": turns}
     shapes |= {"translations": (frames, joints, 3)} if "translations" in data else {"root": (frames, 3)}
     for key, shape in shapes.items():
         if data[key].shape != shape or data[key].dtype.kind not in "fiu" or not np.isfinite(data[key]).all():
             found = f"{data[key].dtype} {data[key].shape}"
             raise InputError(f"{file}: {key}", expected=f"finite numbers {shape}", found=found)
+    if len(turns) == 3:
+        data["rotations"] = from_rotation_vector(data["rotations"].astype(np.float64))
+    off = np.abs(np.swapaxes(data["rotations"], -1, -2) @ data["rotations"] - np.eye(3)).max(initial=0.0)
+    if off > NOT_TURNED or (np.linalg.det(data["rotations"]) < 0).any():
+        raise InputError(f"{file}: rotations", expected="rotation matrices", found=f"|R^T R - I| up to {off:.3g}")
     parents = data["parents"]
     if joints == 0 or parents[0] != -1 or not all(0 <= p < j for j, p in enumerate(parents[1:], start=1)):
         expected = "one root at index 0 and every parent before its children"
@@ -225,7 +230,7 @@ def _rig(file: Path, frames: int) -> Rig:
     if "root" in shapes:
         shift[:, 0] = data["root"]
     return Rig(
-        names=tuple(str(n) for n in data["names"]),
+        names=tuple(str(n) for n in data["names"].ravel()),
         parents=parents.astype(np.int32),
         joints=data["joints"].astype(np.float32),
         weights=np.zeros((0, joints), np.float32),

@@ -15,6 +15,7 @@ RIGID = 1e-3  # a rotation's largest deviation from orthonormal
 SAME_CAMERA = 1e-5  # of the scene's size
 NEAR_TIMES = 0.1  # of the usual step between times
 BORDER = 0.9  # of the border's pixels: alpha that covers more is inverted, or the camera is in the subject
+NARROW = 0.05  # of the image's width: a focal length below it, 170 degrees, was not given in pixels
 FAINT = 8  # alpha below it is no subject
 
 
@@ -23,8 +24,9 @@ def check(where: str, capture: Capture, *, training: bool) -> Capture:
     reconstructed from it, for which one camera that stands still is not enough.
 
     Raises InputError for images without alpha and no background given, times out of 0..1 or not rising, a camera or
-    frame number out of range, matrices that are no cameras, cameras that look away from what the others see or stand in
-    the subject, inverted masks, and one standing camera with a time of its own for each image.
+    frame number out of range, matrices that are no cameras, focal lengths not in pixels, cameras that look away from
+    what the others see or stand in the subject, inverted and empty masks, and one standing camera with a time of its
+    own for each image.
     """
     _numbers(where, capture)
     _times(where, capture.times)
@@ -32,6 +34,8 @@ def check(where: str, capture: Capture, *, training: bool) -> Capture:
     if capture.has_alpha:
         _borders(where, capture)
     if training:
+        shows = not capture.has_alpha or bool((capture.images[..., 3] >= FAINT).any())
+        _check(shows, f"{where}: alpha", "images of a subject", "none that shows anything", "check the masks")
         _still_camera(where, capture)
     _inside(where, capture)
     return capture
@@ -107,8 +111,9 @@ def _cameras(where: str, capture: Capture) -> None:
         rigid = np.isfinite(view).all() and np.abs(turn @ turn.T - np.eye(3)).max() < RIGID and np.linalg.det(turn) > 0
         do = "give matrices without scale or mirroring"
         _check(rigid, f"{where}: camera of image {i}", "a rotation and a shift", turn.round(3).tolist(), do)
-        good = np.isfinite(k).all() and k[0, 0] > 0 and k[1, 1] > 0
-        _check(good, f"{where}: intrinsics of image {i}", "focal lengths above zero", np.asarray(k).round(3).tolist())
+        good = np.isfinite(k).all() and min(k[0, 0], k[1, 1]) > NARROW * capture.size[1]
+        expected = f"focal lengths in pixels, over {NARROW * capture.size[1]:.3g}"
+        _check(good, f"{where}: intrinsics of image {i}", expected, np.asarray(k).round(3).tolist())
 
 
 def _borders(where: str, capture: Capture) -> None:

@@ -140,6 +140,11 @@ CHANGES = {
     "time out of range": (lambda c: c["frames"][3].update(time=1.5), ["time", "1.5", "image 3"]),
     "time not a number": (lambda c: c["frames"][3].update(time="late"), ["time", "numbers"]),
     "no angle": (lambda c: c.pop("camera_angle_x"), ["camera_angle_x"]),
+    "an angle in degrees": (lambda c: c.update(camera_angle_x=40), ["camera_angle_x in radians", "= 40"]),
+    "a focal length in shares": (lambda c: c.update(fl_x=1.2), ["intrinsics of image 0", "in pixels"]),
+    "a rate in words": (lambda c: c.update(fps="fast"), ["fps", "'fast'"]),
+    "a file elsewhere": (lambda c: c["frames"][5].update(file_path="/nowhere/r_5"), ["no /nowhere/r_5.png", "1 of"]),
+    "a name too long": (lambda c: c["frames"][5].update(file_path="x" * 999), ["xxx", "1 of 12"]),
     "negative angle": (lambda c: c.update(camera_angle_x=-1), ["camera_angle_x = -1"]),
     "no frames": (lambda c: c.update(frames=[]), ["frames", "list of images"]),
     "no matrix": (lambda c: c["frames"][2].pop("transform_matrix"), ["frames[2].transform_matrix", "4 x 4"]),
@@ -373,11 +378,30 @@ def test_missing_frames_and_bad_skeletons_are_one_line(tmp_path, ring):
     multiview.write_multiview(*ring, tmp_path)
     np.savez(tmp_path / "skeleton.npz", names=np.array(["a"]))
     refused(lambda: multiview.load(path=str(tmp_path), **MULTIVIEW), "skeleton.npz", "parents")
+    rig = {"names": np.array(["a"]), "parents": np.array([-1]), "joints": np.zeros((1, 3)), "root": np.zeros((6, 3))}
+    for turns in (np.zeros((6, 1, 2)), np.full((6, 1, 3), "x"), np.zeros((5, 1, 3)), np.zeros((6, 1, 3, 3))):
+        np.savez(tmp_path / "skeleton.npz", **rig, rotations=turns)
+        refused(lambda: multiview.load(path=str(tmp_path), **MULTIVIEW), "skeleton.npz: rotations")
+    np.savez(tmp_path / "skeleton.npz", **rig | {"names": np.array("a")}, rotations=np.zeros((6, 1, 3)))
+    assert multiview.load(path=str(tmp_path), **MULTIVIEW)[0].rig.names == ("a",)
     (tmp_path / "skeleton.npz").write_bytes(b"nothing")
     refused(lambda: multiview.load(path=str(tmp_path), **MULTIVIEW), "skeleton.npz")
     (tmp_path / "skeleton.npz").unlink()
     (tmp_path / "frames" / "train01" / "000002.png").unlink()
     refused(lambda: multiview.load(path=str(tmp_path), **MULTIVIEW), "train01", "no frame 2")
+
+
+def test_masks_that_show_nothing_are_one_line(scene):
+    for file in (scene / "train").iterdir():
+        file.write_bytes(files.png(0 * files.read_image(file)[0]))
+    refused(lambda: load(scene), "alpha", "none that shows anything")
+
+
+def test_json_as_windows_writes_it_and_json_without_end(tmp_path):
+    (tmp_path / "a.json").write_bytes(b"\xef\xbb\xbf{}")
+    assert files.read_json(tmp_path / "a.json") == {}
+    (tmp_path / "a.json").write_text("[" * 100_000)
+    refused(lambda: files.read_json(tmp_path / "a.json"), "a.json", "JSON")
 
 
 def test_layouts_refuse_what_they_cannot_hold(tmp_path, monocular, ring):

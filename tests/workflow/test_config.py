@@ -77,6 +77,7 @@ def one_line(error: InputError) -> str:
         (["method=mlp", "animate.rate=-1"], ["animate.rate", "above 0", "found -1"]),
         (["split.observed=1.5"], ["split.observed", "above 0 and at most 1", "found 1.5"]),
         (["runner.workers=0"], ["runner.workers", "1 or more"]),
+        (["store.path=''"], ["store.path", "a folder"]),
         (["report.name=../other"], ["report.name", "../other", "report.path"]),
         (["bones.max_bones="], ["bones.max_bones"]),
         (["bones.max_bones=1,2"], ["bones.max_bones", "add -m"]),

@@ -251,6 +251,8 @@ def test_a_place_where_no_report_can_lie_is_said_before_anything_runs(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match=r"report.path.*a file"):
         check_place(tmp_path / "file" / "reports")
+    with pytest.raises(InputError, match=r"report\.name"):
+        check_place(tmp_path / ("x" * 300))
 
 
 def test_short_names():

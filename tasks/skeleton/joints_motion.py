@@ -16,11 +16,11 @@ from tasks.geometry.neighbours import adjacency, mesh_edges
 from tasks.geometry.rotations import geodesic, project_so3
 from tasks.skeleton.articulation import centres, off_hinges
 from tasks.skeleton.curve_weights import Interpolation, node_lengths, node_weights, onto_surface, thin, vertex_areas
-from tasks.skeleton.inner_bones import Bones, merge_alike, prune, relative_turn, rigid_pieces
+from tasks.skeleton.inner_bones import Bones, absence, merge_alike, prune, relative_turn, rigid_pieces
 from tasks.skeleton.refit import posed, refit, spread_weights
 from tasks.skeleton.runs import find_runs
 from tasks.skeleton.symmetry import Mirror, find_mirror
-from tasks.skeleton.tree import joint_names, kinematic_tree, link_components
+from tasks.skeleton.tree import joint_names, kinematic_tree, link_components, to_ends
 from tasks.values import Canonical, Curve, Motion, Skeleton, Skinning, Surface
 
 _PULL = 0.001
@@ -36,6 +36,7 @@ _LIMBS, _TRUNK = 3, 0.3  # the root has at least so many bones round it, and thi
 _FAR = 0.15  # of the diagonal: farther from its joint, the skin that two bones share says nothing of it
 _GAP = 0.003  # of the diagonal: what taking a joint along its hinge to there may cost
 _LEAST = 3  # points that a piece needs to turn as a whole
+_TIP, _TIP_MISSED = 0.08, 2.0  # of the diagonal: length of a limb's tip; times ``missed`` for a bone in it to be kept
 _WARM_UP = 3  # rounds of SSDR before pruning
 
 
@@ -54,9 +55,18 @@ class Body:
         """Weights of the bones' points (N, B) on the curve's nodes (M, B)."""
         return node_weights(self.curve, self.carry.carry(weights))
 
-    def dominant(self, bones: Bones) -> Bones:
-        """Only the bones that weigh most at some node of the curve: the others move skin but no limb."""
-        return bones.keep(np.unique(self.on_curve(bones.weights).argmax(axis=1)))
+    def limbs(self, bones: Bones, missed: float) -> Bones:
+        """Only the bones that weigh most at some node of the curve: the others move skin but no limb. But all fingers
+        of a hand share one end of the curve, as do the two ends of an ear: near an end a bone stays, too, if it owns
+        points that would miss by ``_TIP_MISSED`` times ``missed`` degrees without it."""
+        on_curve = self.on_curve(bones.weights)
+        shown = np.unique(on_curve.argmax(axis=1))
+        hidden = np.setdiff1d(np.arange(bones.count), shown)
+        owned = np.bincount(bones.weights.argmax(axis=1), minlength=bones.count)
+        near = to_ends(self.curve)[on_curve[:, hidden].argmax(axis=0)] <= _TIP * self.size
+        tips = hidden[near & (owned[hidden] >= _LEAST)]
+        turns = absence(bones, tips, self.size)[:, 0]
+        return bones.keep(np.sort(np.concatenate([shown, tips[turns >= np.radians(_TIP_MISSED * missed)]])))
 
 
 @dataclass(frozen=True)
@@ -171,7 +181,7 @@ def few_bones(
     label = _pieces(bones, body)
     bones = rigid_pieces(bones, label, _LEAST).improve(_WARM_UP)
     bones = prune(bones, body.size, knee=knee, angle=missed, at_most=at_most).improve(rounds)
-    bones = body.dominant(bones).improve(rounds)
+    bones = body.limbs(bones, missed).improve(rounds)
     on_curve = body.on_curve(bones.weights)
     shared = on_curve.T @ (on_curve * node_lengths(body.curve)[:, None])
     bones = merge_alike(bones, np.where(shared > 1e-3 * node_lengths(body.curve).mean(), shared, 0.0), angle)

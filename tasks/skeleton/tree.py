@@ -7,6 +7,8 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, connected_components, dijkstra, minimum_spanning_tree
 from scipy.spatial import cKDTree
 
+from tasks.values import Curve
+
 
 def lengths(nodes: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """(E,) length of every edge."""
@@ -24,6 +26,15 @@ def graph(edges: np.ndarray, costs: np.ndarray, count: int) -> csr_matrix:
     low, high, costs = low[first], high[first], costs[first]
     rows, columns = np.concatenate([low, high]), np.concatenate([high, low])
     return csr_matrix((np.concatenate([costs, costs]), (rows, columns)), shape=(count, count))
+
+
+def to_ends(curve: Curve) -> np.ndarray:
+    """(M,) way along the curve from every node to the nearest end; infinite where there is none."""
+    count = len(curve.nodes)
+    ends = np.flatnonzero(np.bincount(curve.edges.ravel(), minlength=count) == 1)
+    if len(ends) == 0:
+        return np.full(count, np.inf)
+    return dijkstra(graph(curve.edges, lengths(curve.nodes, curve.edges), count), indices=ends, min_only=True)
 
 
 def link_components(nodes: np.ndarray, edges: np.ndarray) -> np.ndarray:

@@ -15,9 +15,10 @@ from tasks.geometry.rotations import from_rotation_vector, geodesic
 from tasks.geometry.skinning import skin
 from tasks.geometry.sparse_weights import fit_weights
 from tasks.skeleton.articulation import centres, off_hinges
+from tasks.skeleton.curve_weights import onto_surface
 from tasks.skeleton.inner_bones import Bones, prune
 from tasks.skeleton.joints_gradient import joints_by_gradient
-from tasks.skeleton.joints_motion import Articulation, _root, joints_by_motion, keep_inside
+from tasks.skeleton.joints_motion import Articulation, Body, _root, joints_by_motion, keep_inside
 from tasks.skeleton.poses import fit_poses
 from tasks.skeleton.symmetry import find_mirror
 from tasks.values import Curve, Skinning
@@ -271,6 +272,30 @@ def test_pruning_keeps_small_bones_that_turn_and_drops_large_ones_that_do_not():
     kept = prune(bones, 4.0, knee=1.7, angle=6.0, at_most=10)
     assert kept.count == 3
     assert kept.error() < 1e-3
+
+
+def test_of_bones_that_own_no_curve_those_at_a_limbs_end_stay_if_they_turn():
+    """Three quarters of the skin of two stretches, amid the body and at its tip, hide the bone of the fourth."""
+    shape = Bending(4.0, [0.0], np.zeros((40, 1, 3)), np.zeros((40, 3)), 0.05)
+    rest, upper = shape.canonical.points, shape.canonical.points[:, 1] > 0.5 * RADIUS
+    owner = np.zeros(len(rest), int)
+    for bone, low in ((1, 1.8), (3, 3.8)):
+        stretch = (rest[:, 0] > low) & (rest[:, 0] < low + 0.4)
+        owner[stretch], owner[stretch & upper] = bone, bone + 1
+    weights = np.eye(5, dtype=np.float32)[owner]
+    body = Body(shape.surface, shape.curve, onto_surface(shape.canonical, shape.surface), 4.0, None)
+
+    def kept(twist: float) -> int:
+        turns = np.zeros((40, 5, 3))
+        turns[:, [1, 3], 2] = 0.5 * np.sin(np.linspace(0.0, 6.0, 40))[:, None]
+        turns[:, [2, 4]] = turns[:, [1, 3]]
+        turns[:, [2, 4], 0] = np.cos(np.linspace(0.0, 9.0, 40))[:, None] * [twist, -twist]
+        transforms = rigid.make(from_rotation_vector(turns), np.zeros((40, 5, 3)))
+        bones = Bones(rest.astype(float), skin(rest, weights, transforms), weights, transforms, 4)
+        return body.limbs(bones, SETTINGS["missed"]).count
+
+    assert kept(0.6) == 4
+    assert kept(0.03) == 3  # hardly away from the bone that hides it
 
 
 def test_the_root_is_the_calm_bone_of_the_trunk_not_the_largest_nor_a_calm_leaf():

@@ -7,6 +7,7 @@ config answers at once, before torch or Prefect are imported.
 from __future__ import annotations
 
 import copy
+import difflib
 import itertools
 import re
 from collections.abc import Iterator
@@ -23,7 +24,7 @@ from hydra._internal.defaults_list import create_defaults_list
 from hydra._internal.utils import create_config_search_path
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
+from hydra.core.override_parser.types import Glob, Override
 from hydra.errors import HydraException
 from hydra.plugins.config_source import ConfigResult
 from omegaconf import DictConfig, OmegaConf
@@ -37,6 +38,8 @@ CONF = ROOT / "conf"
 NO_ABLATION = "none"
 ADDED = ("experiment", "ablation")  # groups that the config does not choose from by itself: +GROUP=CHOICE
 ALONE = "again"  # the report of a case that is run again by itself
+NAMING = dict.fromkeys(("report.baselines", "report.bounds", "report.gains_of"), "method")
+NAMING |= dict.fromkeys(("evaluate.left_out_of", "sweep.seeds_of"), "dataset")
 SWEPT = ("datasets", "methods", "ablations")  # the axes of an experiment's grid
 SWEEP = dict.fromkeys(("experiments", *SWEPT), list[str] | None)
 SWEEP |= {"seeds": list[schema.SEED] | None, "seeds_of": list[str] | None, "absent": Literal["fail", "skip"]}
@@ -117,7 +120,7 @@ def expand_some(
     if sweeps and not multirun:
         name = sweeps[0].key_or_group
         raise InputError(name, expected="one value", found=sweeps[0].input_line, do="add -m to run all of them")
-    axes = [[parse(f"{_plus(o)}{o.key_or_group}={v}") for v in o.sweep_string_iterator()] for o in sweeps]
+    axes = [[parse(f"{_plus(o)}{o.key_or_group}={v}") for v in _points(o)] for o in sweeps]
     fixed = [o for o in parsed if not o.is_sweep_override()]
     cases: list[Case] = []
     for point in itertools.product(*axes):
@@ -168,6 +171,7 @@ def _sweep(
         name = chosen["dataset"] or config["dataset"].get("kind")
         try:
             config = schema.check_run(schema.check(config, schema.schema(config, SWEEP)))
+            _check_names(config, name)
             nodes = _files(config["dataset"])
         except NotGiven as error:
             if missing is None:
@@ -179,6 +183,18 @@ def _sweep(
             alone = _alone(chosen, ablation, kept, node.get("path"), seed)
             filled = config | {"dataset": node, "method_seed": seed}
             yield Case(name, config["animate"]["name"], variant, filled, alone)
+
+
+def _check_names(config: dict, dataset: str) -> None:
+    """Raises InputError for settings that name a method or dataset which is none: they would be passed over."""
+    valid = {"method": [*groups()["method"], config["animate"]["name"]], "dataset": [*groups()["dataset"], dataset]}
+    for path, kind in NAMING.items():
+        group, key = path.split(".")
+        unknown = [name for name in config[group][key] or [] if name not in valid[kind]]
+        if unknown:
+            near = difflib.get_close_matches(unknown[0], valid[kind], 1)
+            do = f"did you mean {near[0]}?" if near else ""
+            raise InputError(path, expected=f"names of {kind}s", found=repr(unknown[0]), do=do)
 
 
 def _seeds(config: dict, dataset: str) -> list[int | None]:
@@ -353,6 +369,17 @@ def _plain(config: DictConfig) -> dict:
         return OmegaConf.to_container(config, resolve=True)
     except OmegaConfBaseException as error:
         raise InputError("config", expected="values that resolve", found=_first_line(error)) from None
+
+
+def _points(override: Override) -> list[str]:
+    """The values that an axis of a multirun takes."""
+    pattern, name = override.value(), override.key_or_group
+    if not isinstance(pattern, Glob):
+        return list(override.sweep_string_iterator())
+    found = pattern.filter(groups().get(name, []))
+    if not found:
+        raise InputError(name, expected="a pattern that some choice of a group matches", found=override.input_line)
+    return found
 
 
 def _plus(override: Override) -> str:

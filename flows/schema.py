@@ -104,7 +104,7 @@ REPORT = {
     "baselines": list[str],
     "bounds": list[str],
     "gains_of": list[str],
-    "paper_table": int | None,
+    "paper_table": Literal[2, 3, 4] | None,
     "curve": list[str] | None,
     "note": str,
 }
@@ -294,10 +294,27 @@ def check_run(config: dict) -> dict:
     name = config["report"]["name"]
     if name in ("", ".", "..") or set(name) & set("/\\%&<>"):
         raise InputError("report.name", expected="the name of a folder", found=repr(name), do="set report.path instead")
+    if not name.isprintable():
+        raise InputError("report.name", expected="the name of a folder, on one line", found=repr(name))
+    _check_curve(config)
     for group in ("store", "report"):
         if not config[group]["path"].strip():
             raise InputError(f"{group}.path", expected="a folder", found=repr(config[group]["path"]))
     return config
+
+
+def _check_curve(config: dict) -> None:
+    from tasks.evaluation.metrics import METRICS
+
+    curve = config["report"]["curve"]
+    if not curve:
+        return
+    value: object = config
+    for part in curve[0].split("."):
+        value = value.get(part) if isinstance(value, dict) else None
+    if len(curve) != 2 or curve[1] not in METRICS or isinstance(value, bool) or not isinstance(value, int | float):
+        expected = "a key of the config that holds a number, and a metric such as rmse"
+        raise InputError("report.curve", expected=expected, found=f"[{', '.join(curve)}]")
 
 
 def unknown_key(path: str, valid: list[str]) -> InputError:

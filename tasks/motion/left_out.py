@@ -21,6 +21,9 @@ def leave_out(
     """
     count = len(train.clip_names)
     if count == 1:
+        if not 2 <= runs <= train.frames:
+            expected = f"2 to {train.frames} stretches of the one training clip"
+            raise InputError("evaluate.left_out", expected=expected, found=str(runs))
         edges = np.linspace(0, train.frames, runs + 1).round().astype(int)
         held = slice(int(edges[run]), int(edges[run + 1]))
         kept = [p for p in (slice(0, held.start), slice(held.stop, train.frames)) if p.stop > p.start]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -70,6 +72,13 @@ def test_one_long_clip_gives_up_stretches(train, unseen):
 def test_more_runs_than_clips_are_refused(train, unseen):
     with pytest.raises(InputError, match=r"evaluate\.left_out.*3 training clips.*4"):
         left_out(train, unseen, 0, runs=4)
+
+
+def test_one_clip_has_no_more_stretches_than_frames_and_gives_up_no_more_than_it_has(train, unseen):
+    lone = replace(train, motion=train.motion.take_clips([0]))
+    for runs in (1, lone.motion.frames + 1):
+        with pytest.raises(InputError, match=rf"evaluate\.left_out.*2 to {lone.motion.frames} stretches"):
+            left_out(lone, unseen, 0, runs=runs)
 
 
 def test_errors_of_the_unseen_and_of_the_clip_left_out_are_told_apart(unseen):

@@ -78,6 +78,13 @@ def one_line(error: InputError) -> str:
         (["split.observed=1.5"], ["split.observed", "above 0 and at most 1", "found 1.5"]),
         (["runner.workers=0"], ["runner.workers", "1 or more"]),
         (["store.path=''"], ["store.path", "a folder"]),
+        (["report.name='a\nb'"], ["report.name", "one line"]),
+        (["report.curve=[animate.k]"], ["report.curve", "[animate.k]"]),
+        (["report.curve=[animate.nope,rmse]"], ["report.curve", "animate.nope"]),
+        (["report.curve=[animate.k,nope]"], ["report.curve", "nope"]),
+        (["report.paper_table=99"], ["report.paper_table", "2, 3, 4"]),
+        (["report.baselines=[lsb]"], ["report.baselines", "'lsb'", "did you mean lbs?"]),
+        (["sweep.seeds_of=[garment_dress]"], ["sweep.seeds_of", "did you mean garments_dress?"]),
         (["report.name=../other"], ["report.name", "../other", "report.path"]),
         (["bones.max_bones="], ["bones.max_bones"]),
         (["bones.max_bones=1,2"], ["bones.max_bones", "add -m"]),
@@ -105,6 +112,14 @@ def test_multirun_is_a_grid_of_variants():
         f"bones.max_bones={b},animate.k={k}" for b in (10, 20) for k in (1, 3)
     ]
     assert {c.config["bones"]["max_bones"] for c in cases} == {10, 20}
+
+
+def test_a_pattern_stands_for_the_choices_it_matches():
+    cases = config.expand(["method=partmm", "+ablation=glob(k_*)", "sweep.methods=null", "sweep.datasets=null"], True)
+    assert [c.variant for c in cases] == [f"ablation={name}" for name in ("k_1", "k_15", "k_3")]
+    for nothing in ("+ablation=glob(zz*)", "seed=glob(1*)"):
+        with pytest.raises(InputError, match="a pattern that some choice"):
+            config.expand([nothing], True)
 
 
 def test_seeds_are_not_variants():

@@ -70,8 +70,8 @@ def fit(
     Curriculum: see :class:`Schedule` for static, grown, coarsest, full (shares).
     Density: ``gaussians`` at the start; every divide_every steps, up to the share divide_until of the iterations, those
     that are pulled hardest are divided, and the number grows by the share ``growth`` up to max_gaussians. In place of
-    the last division hidden ones go: those of which the training images show less than the share least_shown of what
-    they show of the mean Gaussian (:mod:`visibility`); 0 leaves all.
+    the first division with all frames in use, and of the last, hidden ones go: those of which the training images show
+    less than the share least_shown of what they show of the mean Gaussian (:mod:`visibility`); 0 leaves all.
     sh_degree: 0 to 3. structure, cover: weights of 1 - SSIM (GA eq. 2) and of the alpha's error.
     Rigidity (GA eq. 3 and 4): over ``neighbours`` of ``carriers`` (the nodes; or points spread over the thing, moved by
     the network). ``own``: each carrier's own rotation, ``svd``: the one that fits best; weights for ARAP and for kept

@@ -264,8 +264,7 @@ class Fitting:
     def _after(self) -> None:
         recipe, along = self.recipe, self.iteration / self.recipe.iterations
         if self.iteration % recipe.divide_every == 0:
-            last = self.iteration + recipe.divide_every > recipe.divide_until * recipe.iterations
-            if along <= recipe.divide_until and last and recipe.least_shown > 0:
+            if along <= recipe.divide_until and recipe.least_shown > 0 and self._all_are_shown():
                 self._remove_hidden()
             elif along <= recipe.divide_until:
                 density.divide(self.params, self.adam, self.pull, recipe.max_gaussians, recipe.growth, self.rng)
@@ -279,8 +278,14 @@ class Fitting:
         if self.iteration % REPORT == 0 or self.iteration == recipe.iterations:
             self._report()
 
+    def _all_are_shown(self) -> bool:
+        """True at the first division with every frame in use, and at the last one of all."""
+        recipe, grown = self.recipe, self.recipe.grown * self.recipe.iterations
+        first = self.iteration - recipe.divide_every < grown <= self.iteration
+        return first or self.iteration + recipe.divide_every > recipe.divide_until * recipe.iterations
+
     def _remove_hidden(self) -> None:
-        """Takes out what the training images show least of; the steps that are left close what opens."""
+        """Takes out what the training images show least of; the steps that follow close what opens."""
         drawn = ((self._views[i], self._drawn(int(f))[0]) for i, f in enumerate(self.capture.frame))
         area = shown(drawn, self.recipe.backend)
         density.keep(self.params, self.adam, np.flatnonzero(area >= self.recipe.least_shown * area.mean()))

@@ -12,7 +12,7 @@ import numpy as np
 from tasks.driving.bvh import Driver, read_bvh
 from tasks.errors import InputError
 from tasks.geometry import kinematics
-from tasks.geometry.rotations import from_rotation_vector, project_so3, to_rotation_vector
+from tasks.geometry.rotations import from_rotation_vector, geodesic, project_so3, to_rotation_vector
 from tasks.values import About, Motion, Poses, Skeleton
 
 WORD = re.compile(r"[^\W_]+")  # of any script
@@ -22,6 +22,7 @@ ARRAYS = ("joint_names", "joint_parents", "joints", "joint_rotations", "joint_tr
 EXPECTED = "a .bvh or .npz file of poses"
 ROUNDED = 1e-2  # of a frame: files give the frame time in few digits
 SLOWEST = 0.1  # frames a second of a file: below it is no motion, and filling in between would take all memory
+TILTED = np.radians(45)  # between the hips of two skeletons at rest: beyond it one of them does not stand
 LYING = 0.7  # of a length: a body that leans so far towards a side in the median lies there
 LEAST = 0.5  # of the joints that move skin: with fewer matched it is another creature
 
@@ -139,11 +140,18 @@ def _into_line(parents: np.ndarray, rest: np.ndarray, driver: Driver, match: np.
         a, b = (v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-9) for v in (a, b))
         spread = np.linalg.svd(a)[1]
         if len(ends) > 1 and spread[1] > 0.3:  # two directions and more decide a rotation
-            out[j] = project_so3(b.T @ a)
+            out[j] = project_so3(b.T @ a) if p >= 0 else _standing(project_so3(b.T @ a))
         else:
             before = out[p] if p >= 0 else np.eye(3)  # about their own axis, limbs turn as what they hang on
             out[j] = _onto(before @ a.mean(0), b.mean(0)) @ before
     return out, float(own / max(theirs, 1e-9))
+
+
+def _standing(turn: np.ndarray) -> np.ndarray:
+    """The root's own: a small tilt between two characters that stand is where their hips' joints lie, not a pose, so
+    that only the turn about the vertical counts."""
+    upright = from_rotation_vector(np.array([0.0, np.arctan2(turn[0, 2] - turn[2, 0], turn[0, 0] + turn[2, 2]), 0.0]))
+    return upright if geodesic(turn, upright) < TILTED else turn
 
 
 def _placed_on_parent(driver: Driver, joint: int) -> bool:

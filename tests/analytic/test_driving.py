@@ -148,6 +148,20 @@ def test_limbs_of_a_driver_that_looks_backwards_turn_with_the_body(tmp_path):
     np.testing.assert_allclose(turned[0, :, :, :3], np.tile(np.diag([-1.0, 1, -1]), (6, 1, 1)), atol=1e-5)
 
 
+def test_hip_joints_that_lie_elsewhere_do_not_tilt_the_body(tmp_path):
+    """The driver's legs begin before its hips, ours below them: both stand, and so does what is driven."""
+    before = T_POSE.copy()
+    before[4:, 2] += 0.06
+    still = Poses(np.tile(np.eye(3, dtype=np.float32), (2, 6, 1, 1)), np.zeros((2, 6, 3), np.float32), np.array([0, 2]))
+    turn = from_rotation_vector(np.array([0.0, 0.8, 0.0]))
+    (tmp_path / "t.bvh").write_text(
+        bvh.write_bvh(skeleton((before @ turn.T).astype(np.float32)), still, slice(0, 2), fps=FPS)
+    )
+    _, poses, _ = drive(tmp_path / "t.bvh")
+    np.testing.assert_allclose(poses.rotations[0, 0][:, 1], [0, 1, 0], atol=1e-6)
+    assert geodesic(poses.rotations[0, 0], turn) < geodesic(np.eye(3), turn)
+
+
 def nested(pose: Poses) -> str:
     """A BVH whose root, a node on the ground, stands still, while the hips carry the path."""
     text = bvh.write_bvh(skeleton(), pose, slice(0, len(pose.rotations)), fps=FPS)

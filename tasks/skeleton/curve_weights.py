@@ -50,6 +50,13 @@ def thin(canonical: Canonical, surface: Surface, curve: Curve, most: int) -> np.
     return np.unique(cKDTree(canonical.points).query(surface.vertices[chosen])[1])
 
 
+def sampled(canonical: Canonical, chosen: np.ndarray) -> Canonical:
+    """The chosen points as bare points; the whole shape where all are chosen."""
+    if len(chosen) == len(canonical.points):
+        return canonical
+    return Canonical(canonical.points[chosen], None, canonical.frame, canonical.source)
+
+
 def node_weights(curve: Curve, on_surface: np.ndarray) -> np.ndarray:
     """Weights of the curve's nodes: the mean over the vertices that collapsed there (V, B) -> (M, B); nodes that
     none collapsed onto take the mean of their neighbours along the curve."""

@@ -15,12 +15,15 @@ from tasks.geometry.rotations import from_rotation_vector, geodesic
 from tasks.geometry.skinning import skin
 from tasks.geometry.sparse_weights import fit_weights
 from tasks.skeleton.articulation import centres, off_hinges
+from tasks.skeleton.body import Body
 from tasks.skeleton.curve_weights import onto_surface
 from tasks.skeleton.inner_bones import Bones, prune
 from tasks.skeleton.joints_gradient import joints_by_gradient
-from tasks.skeleton.joints_motion import Articulation, Body, _root, joints_by_motion, keep_inside
+from tasks.skeleton.joints_motion import joints_by_motion
+from tasks.skeleton.linking import Articulation, root_of
 from tasks.skeleton.poses import fit_poses
 from tasks.skeleton.symmetry import find_mirror
+from tasks.skeleton.tree_fit import keep_inside
 from tasks.values import Curve, Skinning
 from tests.analytic.jointed_shapes import RADIUS, Bending, ball_joint
 from tests.shipped import shipped
@@ -307,4 +310,4 @@ def test_the_root_is_the_calm_bone_of_the_trunk_not_the_largest_nor_a_calm_leaf(
     bones = Bones(np.zeros((1, 3)), np.zeros((50, 1, 3), np.float32), np.ones((1, 7)), transforms, 4)
     areas = np.array([2.0, 2.5, 1.0, 1.0, 1.0, 1.0, 6.0])
     found = Articulation(bones, links, np.zeros((6, 3)), np.zeros(6), np.ones(6), np.zeros((7, 3)), areas)
-    assert _root(found) == 0
+    assert root_of(found) == 0

@@ -26,6 +26,7 @@ h1 { font-size: 1.5rem; line-height: 1.25; margin: .4rem 0 1rem }
 h2 { font-size: 1.1rem; margin: 2.2rem 0 .6rem }
 figure { margin: 1.2rem 0 2rem }
 figcaption { font-weight: 600; margin: 0 0 .5rem }
+p.grid { margin: 1rem 0 .4rem; font-size: .92rem }
 .scroll { overflow-x: auto; border: 1px solid var(--line); border-radius: 8px; -webkit-overflow-scrolling: touch }
 table { border-collapse: collapse; width: 100%; font-size: .92rem; font-variant-numeric: tabular-nums }
 th, td { padding: .42rem .8rem; text-align: right; white-space: nowrap; border-bottom: 1px solid var(--line) }

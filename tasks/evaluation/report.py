@@ -120,7 +120,8 @@ def replace_files(folder: Path, files: Mapping[str, bytes]) -> int:
     """Writes some files of a report over those it has and their checksums into its provenance; returns how many
     changed."""
     origin = read_provenance(folder)
-    changed = {name: data for name, data in files.items() if (folder / name).read_bytes() != data}
+    there = {name: (folder / name).read_bytes() for name in files if (folder / name).is_file()}
+    changed = {name: data for name, data in files.items() if there.get(name) != data}
     sums = {name: hashlib.sha256(data).hexdigest() for name, data in changed.items()}
     text = json.dumps({**origin, "files": origin["files"] | sums}, indent=2, allow_nan=False) + "\n"
     for name, data in {**changed, PROVENANCE: text.encode()}.items() if changed else ():

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 from typing import Literal
 
 import pandas as pd
@@ -16,6 +17,8 @@ import pandas as pd
 from tasks.evaluation.metrics import metric_of, score
 from tasks.evaluation.paper import Paper, PaperCell
 
+WIDEST = 9  # columns that stand side by side on a page
+PRINTED = "printed in the paper, not run"
 Row = tuple[str, str]  # method, variant
 Place = tuple[str, str, str]  # dataset, subject, metric
 
@@ -63,6 +66,26 @@ class Column:
 
 
 @dataclass(frozen=True)
+class Grid:
+    """Columns of a table that stand side by side. title: what they have in common, or ""; rows: the numbers of the
+    table's rows that say something in them."""
+
+    title: str
+    columns: tuple[Column, ...]
+    rows: tuple[int, ...]
+
+    @property
+    def groups(self) -> list[str]:
+        """The subject over each column; none where the title names it."""
+        return [] if {c.group for c in self.columns} == {self.title} else [c.group for c in self.columns]
+
+    @property
+    def labels(self) -> list[str]:
+        """The metric over each column; none where the title names it."""
+        return [] if {c.label for c in self.columns} == {self.title} else [c.label for c in self.columns]
+
+
+@dataclass(frozen=True)
 class Table:
     """rows: their labels; notes: remarks on the whole table."""
 
@@ -82,8 +105,23 @@ class Table:
     @property
     def footnotes(self) -> list[str]:
         """The cells' notes, each once, in reading order; a cell's mark is its note's place in here, from 1."""
-        cells = (column.cells[r] for r in range(len(self.rows)) for column in self.columns)
+        cells = (column.cells[r] for grid in self.grids() for r in grid.rows for column in grid.columns)
         return list(dict.fromkeys(cell.note for cell in cells if cell.note))
+
+    def grids(self, widest: int = WIDEST) -> list[Grid]:
+        """The table in pieces that a page can hold: one where all fits, else one a metric or one a subject, whichever
+        are fewer; last what only the paper has."""
+        measured = {column.group for column in self.columns if column.kind == "ours"}
+        ours = [column for column in self.columns if column.group in measured]
+        pieces = _pieces(ours, widest)
+        pieces += [(PRINTED, part) for part in _packed([c for c in self.columns if c not in ours], widest)]
+        found = []
+        for title, columns in pieces:
+            says = [
+                any(c.cells[r].value is not None or c.cells[r].note for c in columns) for r in range(len(self.rows))
+            ]
+            found.append(Grid(title, tuple(columns), tuple(r for r, something in enumerate(says) if something)))
+        return found
 
 
 def build(
@@ -171,6 +209,29 @@ def digits_for(values: Sequence[float], metric: str) -> int:
     largest, smallest = (math.floor(math.log10(v)) for v in (max(sizes), min(sizes)))
     least = min(max(2 - largest, 0), 8)
     return max(least, min(1 - smallest, least + 2, 8))
+
+
+def _pieces(columns: list[Column], widest: int) -> list[tuple[str, list[Column]]]:
+    if len(columns) <= widest:
+        return [("", columns)] if columns else []
+    by_metric, by_subject = {}, {}
+    for column in columns:
+        by_metric.setdefault(column.label, []).append(column)
+        by_subject.setdefault(column.group, []).append(column)
+    parts = by_metric if len(by_metric) <= len(by_subject) else by_subject
+    return [(title, some) for title, part in parts.items() for some in _packed(part, widest)]
+
+
+def _packed(columns: list[Column], widest: int) -> list[list[Column]]:
+    """The columns in stretches of about equal width; those of one subject and metric stay together."""
+    together = [list(part) for _, part in groupby(columns, key=lambda c: (c.group, c.metric))]
+    width = math.ceil(len(columns) / max(1, math.ceil(len(columns) / widest)))
+    found: list[list[Column]] = []
+    for part in together:
+        if not found or len(found[-1]) + len(part) > width:
+            found.append([])
+        found[-1] += part
+    return found
 
 
 def _measured(rows: pd.DataFrame, metrics: Sequence[str]) -> dict[Place, dict[Row, tuple[Cell, str]]]:

@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING
 from jinja2 import Environment
 from markupsafe import Markup, escape
 
-from tasks.evaluation.tables import Cell, Column, Table
+from tasks.evaluation.tables import Cell, Column, Grid, Table
 
 if TYPE_CHECKING:
     import rich.console
     import rich.table
+
+NARROW = 4  # columns side by side in a terminal
 
 
 def number(value: float, digits: int, *, signed: bool = False) -> str:
@@ -41,7 +43,7 @@ def data_text(column: Column) -> str:
 
 
 def markdown(table: Table) -> str:
-    """A pipe table whose first row says what data is behind each column."""
+    """Pipe tables, their first rows say what data is behind each column."""
     footnotes = table.footnotes
 
     def show(column: Column, cell: Cell) -> str:
@@ -49,13 +51,18 @@ def markdown(table: Table) -> str:
         main = {1: f"**{main}**", 2: f"<ins>{main}</ins>"}.get(cell.rank, main)
         return main + rest + (f" <sup>{footnotes.index(cell.note) + 1}</sup>" if cell.note else "")
 
-    lines = [["method", *(f"{c.group}<br>{c.label}" for c in table.columns)]]
-    lines.append(["---", *("---:" for _ in table.columns)])
-    lines.append(["*data*", *(f"*{data_text(c)}*" for c in table.columns)])
-    lines += [[label, *(show(c, c.cells[r]) for c in table.columns)] for r, label in enumerate(table.rows)]
-    grid = "\n".join("| " + " | ".join(text.replace("|", "\\|") for text in line) + " |" for line in lines)
+    def grid(part: Grid) -> str:
+        names = [part.groups or part.labels, part.labels if part.groups else []]
+        heads = ["<br>".join(words) for words in zip(*filter(None, names), strict=True)]
+        lines = [["method", *heads], ["---", *("---:" for _ in heads)]]
+        lines.append(["*data*", *(f"*{data_text(c)}*" for c in part.columns)])
+        lines += [[table.rows[r], *(show(c, c.cells[r]) for c in part.columns)] for r in part.rows]
+        text = "\n".join("| " + " | ".join(text.replace("|", "\\|") for text in line) + " |" for line in lines)
+        return f"*{part.title}*\n\n{text}" if part.title else text
+
+    grids = [grid(part) for part in table.grids()]
     marks = [f"<sup>{i}</sup> {note}." for i, note in enumerate(footnotes, start=1)]
-    return "\n\n".join([f"**{table.title}**", grid, *table.remarks, *marks]) + "\n"
+    return "\n\n".join([f"**{table.title}**", *grids, *table.remarks, *marks]) + "\n"
 
 
 _LATEX = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
@@ -75,46 +82,63 @@ def latex(table: Table) -> str:
         main = {1: rf"\textbf{{{main}}}", 2: rf"\underline{{{main}}}"}.get(cell.rank, main)
         return main + rest + (f"\\textsuperscript{{{footnotes.index(cell.note) + 1}}}" if cell.note else "")
 
-    spans, rules, at = [], [], 2
-    for group, columns in groupby(table.columns, key=lambda c: c.group):
-        width = len(list(columns))
-        spans.append(rf"\multicolumn{{{width}}}{{c}}{{{text(group)}}}")
-        rules.append(rf"\cmidrule(lr){{{at}-{at + width - 1}}}")
-        at += width
-    lines = [["", *spans], ["method", *(text(c.label) for c in table.columns)]]
-    lines.append(["", *(rf"\textit{{{text(data_text(c))}}}" for c in table.columns)])
-    body = [[text(label), *(show(c, c.cells[r]) for c in table.columns)] for r, label in enumerate(table.rows)]
-    head, names, data, *rest = (" & ".join(line) + r" \\" for line in [*lines, *body])
+    def tabular(part: Grid) -> list[str]:
+        lines = [["", *(text(data_text(c)).join((r"\textit{", "}")) for c in part.columns)]]
+        lines += [[text(table.rows[r]), *(show(c, c.cells[r]) for c in part.columns)] for r in part.rows]
+        data, *body = (" & ".join(line) + r" \\" for line in lines)
+        head, at = [], 2
+        if part.groups:
+            spans, rules = [""], []
+            for group, columns in groupby(part.groups):
+                width = len(list(columns))
+                spans.append(rf"\multicolumn{{{width}}}{{c}}{{{text(group)}}}")
+                rules.append(rf"\cmidrule(lr){{{at}-{at + width - 1}}}")
+                at += width
+            head = [" & ".join(spans) + r" \\", " ".join(rules)]
+        if part.labels:
+            head.append(" & ".join(["method", *map(text, part.labels)]) + r" \\")
+        title = [rf"\textit{{{text(part.title)}}}", ""] if part.title else []
+        start = rf"\begin{{tabular}}{{l{'r' * len(part.columns)}}}"
+        return [*title, start, r"\toprule", *head, data, r"\midrule", *body, r"\bottomrule", r"\end{tabular}", ""]
+
     marks = [rf"\textsuperscript{{{i}}} {text(note)}." for i, note in enumerate(footnotes, start=1)]
     parts = [r"\begin{table}", r"\centering", r"\small", rf"\caption{{{text(table.title)}}}"]
-    parts += [rf"\begin{{tabular}}{{l{'r' * len(table.columns)}}}", r"\toprule", head, " ".join(rules), names, data]
-    parts += [r"\midrule", *rest, r"\bottomrule", r"\end{tabular}", "", r"\smallskip", r"\footnotesize"]
+    for part in table.grids():
+        parts += [*tabular(part), r"\smallskip"]
     notes = [*(text(note) for note in table.remarks), *marks]
-    return "\n".join([*parts, r" \\ ".join(notes), r"\end{table}"]) + "\n"
+    return "\n".join([*parts, r"\footnotesize", r" \\ ".join(notes), r"\end{table}"]) + "\n"
 
 
 _HTML = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(
     """\
 <figure class="table">
 <figcaption>{{ table.title }}</figcaption>
+{% for grid in table.grids() %}
+{% if grid.title %}
+<p class="grid">{{ grid.title }}</p>
+{% endif %}
 <div class="scroll">
 <table>
 <thead>
-<tr><th></th>{% for group, columns in groups %}<th class="group" colspan="{{ columns | length }}">{{ group }}</th>\
+{% if grid.groups %}
+<tr><th></th>{% for group, width in spans(grid.groups) %}<th class="group" colspan="{{ width }}">{{ group }}</th>\
 {% endfor %}</tr>
-<tr><th>method</th>{% for c in table.columns %}<th>{{ c.label }}</th>{% endfor %}</tr>
-<tr><th></th>{% for c in table.columns %}<th><span class="badge {{ c.kind }} {{ c.status | replace("'s data", "") }}">\
+{% endif %}
+{% if grid.labels %}
+<tr><th>method</th>{% for label in grid.labels %}<th>{{ label }}</th>{% endfor %}</tr>
+{% endif %}
+<tr><th></th>{% for c in grid.columns %}<th><span class="badge {{ c.kind }} {{ c.status | replace("'s data", "") }}">\
 {{ data_text(c) }}</span></th>{% endfor %}</tr>
 </thead>
 <tbody>
-{% for label in table.rows %}
-{% set r = loop.index0 %}
-<tr><th>{{ label }}</th>{% for c in table.columns %}<td class="{{ c.kind }}">{{ show(c, c.cells[r]) }}</td>{% endfor %}\
-</tr>
+{% for r in grid.rows %}
+<tr><th>{{ table.rows[r] }}</th>{% for c in grid.columns %}<td class="{{ c.kind }}">{{ show(c, c.cells[r]) }}</td>\
+{% endfor %}</tr>
 {% endfor %}
 </tbody>
 </table>
 </div>
+{% endfor %}
 <div class="notes">
 {% for note in table.remarks %}
 <p>{{ note }}</p>
@@ -129,7 +153,7 @@ _HTML = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_
 
 
 def html(table: Table) -> str:
-    """A <figure> with the table; its looks come from the page's style sheet (tasks/evaluation/page.py)."""
+    """A <figure> with the table's grids; its looks come from the page's style sheet (tasks/evaluation/page.py)."""
     footnotes = table.footnotes
 
     def show(column: Column, cell: Cell) -> Markup:
@@ -139,46 +163,39 @@ def html(table: Table) -> str:
         after = Markup("<small>{}</small>").format(rest) if rest else ""
         return Markup(tag).format(escape(main)) + after + mark
 
-    groups = [(group, list(columns)) for group, columns in groupby(table.columns, key=lambda c: c.group)]
-    return _HTML.render(table=table, groups=groups, show=show, data_text=data_text, footnotes=footnotes)
+    def spans(groups: list[str]) -> list[tuple[str, int]]:
+        return [(group, len(list(same))) for group, same in groupby(groups)]
+
+    return _HTML.render(table=table, spans=spans, show=show, data_text=data_text, footnotes=footnotes)
 
 
 def terminal(table: Table) -> rich.console.Group:
-    """The table for the terminal: one grid a subject, and one for what is only printed in the paper. The best is bold
-    and green, the second best underlined; a grid leaves out rows that say nothing in it."""
+    """The table for the terminal, in narrower grids than on a page. The best is bold and green, the second best
+    underlined."""
     from rich.console import Group
     from rich.text import Text
 
     footnotes = table.footnotes
     notes = [*table.remarks, *(f"[{i}] {note}." for i, note in enumerate(footnotes, start=1))]
-    measured = {column.group for column in table.columns if column.kind == "ours"}
-    grids: dict[str, list[Column]] = {}
-    for column in table.columns:
-        grids.setdefault(column.group if column.group in measured else "printed in the paper, not run", []).append(
-            column
-        )
-    shown = [_grid(title, table.rows, columns, footnotes) for title, columns in grids.items()]
+    shown = [_grid(table, part, footnotes) for part in table.grids(NARROW)]
     return Group(Text(table.title, "bold"), *shown, Text("\n".join(notes), "dim"))
 
 
-def _grid(title: str, rows: tuple[str, ...], columns: list[Column], footnotes: list[str]) -> rich.table.Table:
-    from rich.table import Table as Grid
+def _grid(table: Table, part: Grid, footnotes: list[str]) -> rich.table.Table:
+    from rich.table import Table as Drawn
     from rich.text import Text
 
-    kinds = {data_text(column) for column in columns}
-    same = f" ({kinds.pop()})" if len(kinds) == 1 else ""
-    grid = Grid(title=Text(title + same, "italic"), title_justify="left")
+    kinds = {data_text(column) for column in part.columns}
+    same = f"({kinds.pop()})" if len(kinds) == 1 else ""
+    grid = Drawn(title=Text(f"{part.title} {same}".strip(), "italic"), title_justify="left")
     grid.add_column("method", no_wrap=True)
-    for column in columns:
-        heading = [column.group] if column.group != title else []
-        data = [] if same else [data_text(column)]
-        grid.add_column(Text("\n".join([*heading, column.label, *data])), justify="right")
-    for r, label in enumerate(rows):
-        cells = [column.cells[r] for column in columns]
-        if all(cell.value is None and not cell.note for cell in cells):
-            continue
-        line = [Text(label)]
-        for column, cell in zip(columns, cells, strict=True):
+    for i, column in enumerate(part.columns):
+        heading = [names[i] for names in (part.groups, part.labels) if names]
+        grid.add_column(Text("\n".join(heading + ([] if same else [data_text(column)]))), justify="right")
+    for r in part.rows:
+        line = [Text(table.rows[r])]
+        for column in part.columns:
+            cell = column.cells[r]
             main, rest = cell_text(column, cell)
             rest = rest.replace("\u00a0", "")  # rich breaks lines at it
             mark = f" [{footnotes.index(cell.note) + 1}]" if cell.note else ""

@@ -205,11 +205,40 @@ def full(config) -> Table:
     return table(rows, paper=paper_of(config), paper_table=3, notes=["100 % of it & <more>."], baselines=["lbs"])
 
 
-def test_markdown_has_one_width(full):
+def test_wide_tables_come_in_pieces_that_hold_every_column_once():
+    def made(subjects: int, metrics: tuple[str, ...]) -> Table:
+        rows = [row("lbs", 1.0 + s, metric=m, unit="ratio", subject=f"s{s}") for s in range(subjects) for m in metrics]
+        return table(rows, metrics=metrics)
+
+    three = ("psnr", "ssim", "flip")
+    assert [g.title for g in made(3, three).grids()] == [""]
+    wide = made(8, three).grids()
+    assert [g.title for g in wide] == ["PSNR ↑", "SSIM ↑", "FLIP ↓"]
+    assert [len(g.columns) for g in wide] == [8, 8, 8]
+    assert [(g.labels, g.groups[0]) for g in wide] == [([], "s0")] * 3
+    assert [len(g.columns) for g in made(12, three).grids()] == [6] * 6
+    narrow = made(2, three).grids(4)
+    assert [(g.title, len(g.columns), g.groups) for g in narrow] == [("s0", 3, []), ("s1", 3, [])]
+    for subjects in range(1, 14):
+        whole = made(subjects, three)
+        shown = [c for g in whole.grids() for c in g.columns]
+        assert sorted(map(repr, shown)) == sorted(map(repr, whole.columns))
+
+
+def test_what_only_the_paper_has_stands_alone_with_the_rows_that_it_has(full):
+    ours, printed = full.grids()
+    assert [c.kind for c in ours.columns] == ["ours"]
+    assert printed.title == "printed in the paper, not run"
+    assert [full.rows[r] for r in printed.rows] == [name for name in full.rows if name != "lbs"]
+
+
+def test_markdown_has_one_width_a_grid(full):
     text = typeset.markdown(full)
     lines = [line for line in text.splitlines() if line.startswith("|")]
-    assert {line.replace("\\|", "").count("|") for line in lines} == {len(full.columns) + 2}
-    assert len(lines) == 3 + len(full.rows)
+    for grid in full.grids():
+        mine, lines = lines[: 3 + len(grid.rows)], lines[3 + len(grid.rows) :]
+        assert {line.replace("\\|", "").count("|") for line in mine} == {len(grid.columns) + 2}
+    assert lines == []
     assert "**17.0**" in text
     assert "<ins>30.0</ins>" in text
     assert "*ours, substitute*" in text
@@ -219,12 +248,12 @@ def test_latex_is_balanced_and_escaped(full):
     text = typeset.latex(full)
     body = [line for line in text.splitlines() if line.endswith(r"\\") and "&" in line]
     widths = {line.replace(r"\&", "").count("&") for line in body if "multicolumn" not in line}
-    assert widths == {len(full.columns)}
+    assert widths == {len(grid.columns) for grid in full.grids()}
     assert text.count("{") - text.count(r"\{") == text.count("}") - text.count(r"\}")
     assert r"a|b\_c \& <d>" in text
     assert r"\textbf{17.0}" in text
     assert r"\underline{30.0}" in text
-    assert text.count(r"\begin{") == text.count(r"\end{") == 2
+    assert text.count(r"\begin{") == text.count(r"\end{") == 1 + len(full.grids())
     assert text.isascii()
 
 
@@ -258,7 +287,7 @@ def test_html_parses_and_is_escaped(full):
     parser = _Cells()
     parser.feed(text)
     assert parser.open == []
-    assert {len(cells) for cells in parser.rows} == {len(full.columns) + 1}
+    assert {len(cells) for cells in parser.rows} == {len(grid.columns) + 1 for grid in full.grids()}
     assert "<b>17.0</b>" in text
     assert "<u>30.0</u>" in text
     assert "<d>" not in text

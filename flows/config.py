@@ -40,6 +40,7 @@ ADDED = ("experiment", "ablation")  # groups that the config does not choose fro
 ALONE = "again"  # the report of a case that is run again by itself
 NAMING = dict.fromkeys(("report.baselines", "report.bounds", "report.gains_of"), "method")
 NAMING |= dict.fromkeys(("evaluate.left_out_of", "sweep.seeds_of"), "dataset")
+PATHS = ("path", "data_root")  # last parts of keys whose values are places on the disk
 SWEPT = ("datasets", "methods", "ablations")  # the axes of an experiment's grid
 SWEEP = dict.fromkeys(("experiments", *SWEPT), list[str] | None)
 SWEEP |= {"seeds": list[schema.SEED] | None, "seeds_of": list[str] | None, "absent": Literal["fail", "skip"]}
@@ -226,7 +227,7 @@ def _alone(
 
 def _quoted(text: str | None) -> str:
     """A value that Hydra's grammar reads back as this text."""
-    plain = text is None or re.fullmatch(r"[\w./:-]+", text)
+    plain = text is None or re.fullmatch(r"[\w./:-]+", text, re.ASCII)
     return str(text) if plain else "'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'"
 
 
@@ -289,10 +290,15 @@ def _nowhere(override: Override, cases: list[Case]) -> InputError:
 def parse(text: str) -> Override:
     """An override of the command line. Raises InputError where it is none, or names no choice of its group."""
     known = groups()
+    key, _, value = text.partition("=")
     try:
         override = OverridesParser.create().parse_override(text)
     except (HydraException, ValueError) as error:  # ValueError: of a number too long to be read
-        raise InputError(_short(text), expected="KEY=VALUE", found=_first_line(error)) from None
+        quoted = value if value.startswith(("'", '"')) else _quoted(value)
+        if key.rpartition(".")[2] in PATHS and quoted != value:  # files have names of any kind
+            return parse(f"{key}={quoted}")
+        do = f"put quotes round what is more than a word: \"{_short(key)}='...'\"" if value else ""
+        raise InputError(_short(text), expected="KEY=VALUE", found=_first_line(error), do=do) from None
     name = override.key_or_group
     if name in ADDED and not override.is_add():
         raise InputError(text, expected=f"+{text}", found=text, do="an experiment or ablation is added with a plus")

@@ -36,7 +36,7 @@ def signature(function: str) -> tuple[tuple[str, ...], dict[str, object]]:
     module, name = function.split(":")
     for node in _tree(module).body:
         if isinstance(node, ast.FunctionDef) and node.name == name:
-            types = {a.arg: _type(a.annotation) for a in node.args.kwonlyargs if a.arg != WORKSPACE}
+            types = {a.arg: _type(a.annotation, function, a.arg) for a in node.args.kwonlyargs if a.arg != WORKSPACE}
             return tuple(a.arg for a in node.args.args), types
     raise LookupError(f"{module} has no function {name}")
 
@@ -96,13 +96,15 @@ def _tree(module: str) -> ast.Module:
     return ast.parse(_source(module))
 
 
-def _type(annotation: ast.expr | None) -> object:
+def _type(annotation: ast.expr | None, function: str, name: str) -> object:
     """The type an annotation names: int, float, str, bool, list[...], Literal[...] and unions of them with None; a
     number may have the interval it lies in, as ``Annotated[float, "(0, 1]"]`` (see :mod:`flows.ranges`)."""
-    if annotation is None:
-        raise TypeError("a setting without a type")
-    code = compile(ast.Expression(annotation), "<annotation>", "eval")
-    return eval(code, {"__builtins__": {}}, dict(_TYPES))
+    try:
+        return eval(compile(ast.Expression(annotation), "<annotation>", "eval"), {"__builtins__": {}}, dict(_TYPES))
+    except (NameError, TypeError, ValueError, AttributeError) as error:
+        found = f"{name}: {ast.unparse(annotation)}" if annotation else f"{name} without a type"
+        expected = f"settings of the types {', '.join(_TYPES)}, or unions of them"
+        raise InputError(function, expected=expected, found=found) from error
 
 
 def _imports(tree: ast.Module) -> list[str]:

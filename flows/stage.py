@@ -14,7 +14,7 @@ import shutil
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
@@ -156,9 +156,8 @@ def _compute(job: Job, store: Store, key: str, say: Callable[[str, float], None]
     one_blas_thread()
     module, name = job.function.split(":")
     function = getattr(importlib.import_module(module), name)
-    kinds = function.__annotations__  # as text
-    inputs = {n: _load(store, value, kinds.get(n, "")) for n, value in job.inputs.items()}
-    if WORKSPACE in kinds:
+    inputs = {n: _load(store, value) for n, value in job.inputs.items()}
+    if WORKSPACE in function.__annotations__:
         folder = store.scratch(job.stage, key)
         with explained(folder):
             folder.mkdir(parents=True, exist_ok=True)
@@ -173,10 +172,10 @@ def _progress(job: Job, say: Callable[[str, float], None], text: str, fraction: 
     say(text, fraction)
 
 
-def _load(store: Store, value: object, kind: str) -> object:
+def _load(store: Store, value: object) -> object:
     if isinstance(value, dict):
-        parts = {n: _load(store, v, "") for n, v in value.items()}
-        return Training(**parts) if kind == "Training" else parts
+        parts = {n: _load(store, v) for n, v in value.items()}
+        return Training(**parts) if parts.keys() == {f.name for f in fields(Training)} else parts
     ref, output = value
     return store.load(ref, output)
 

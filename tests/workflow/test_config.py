@@ -9,7 +9,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from flows import config, ranges, schema
+from flows import config, ranges, schema, source
 from flows.source import ROOT
 from tasks.errors import InputError
 
@@ -120,6 +120,35 @@ def test_a_pattern_stands_for_the_choices_it_matches():
     for nothing in ("+ablation=glob(zz*)", "seed=glob(1*)"):
         with pytest.raises(InputError, match="a pattern that some choice"):
             config.expand([nothing], True)
+
+
+@pytest.mark.parametrize(
+    "name", ["世界.npz", "a(1).npz", "a[1].npz", "it's.npz", "a=b#c.npz", "my rigs/a b.npz", "{x.npz"]
+)
+def test_files_have_names_of_any_kind(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).touch()
+    own = ["dataset=mesh_sequence", "sweep.datasets=null", "method=lbs", "sweep.methods=null"]
+    (case,) = config.expand([*own, f"dataset.path={name}"])
+    assert case.config["dataset"]["path"] == name
+    (alone,) = config.expand(list(case.alone))
+    assert alone.config["dataset"]["path"] == name
+
+
+def test_a_setting_of_another_type_names_function_and_setting(tmp_path, monkeypatch):
+    """As somebody may write it who adds a method."""
+    module = tmp_path / "tasks" / "methods" / "mine.py"
+    module.parent.mkdir(parents=True)
+    monkeypatch.setattr(source, "ROOT", tmp_path)
+    for setting, found in (("strength", "strength without a type"), ("strength: np.ndarray", "strength: np.ndarray")):
+        module.write_text(f"def animate(training, query, *, {setting}):\n    pass\n")
+        source._source.cache_clear()
+        source._tree.cache_clear()
+        with pytest.raises(InputError, match=rf"tasks\.methods\.mine:animate.*{found}"):
+            source.signature("tasks.methods.mine:animate")
+    source._source.cache_clear()
+    source._tree.cache_clear()
 
 
 def test_seeds_are_not_variants():

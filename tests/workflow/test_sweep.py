@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+from dataclasses import fields
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from flows import source
+from flows import source, stage
 from flows.graph import Graph, short
 from flows.progress import Progress
 from flows.runners import task_runner
@@ -15,6 +17,7 @@ from flows.stage import Job, key_of, run
 from flows.store import CorruptArtefact, Store
 from flows.sweep import StageFailed, check_place, compute, raise_first
 from tasks.errors import InputError
+from tasks.values import Training
 from tasks.workspace import Workspace
 
 TOY = "tests.workflow.toy"
@@ -237,6 +240,14 @@ def test_long_stage_goes_on_from_its_workspace(tmp_path):
     told = [json.loads(line) for line in (tmp_path / "events.jsonl").read_text().splitlines()]
     assert [e["fraction"] for e in told if e["event"] == "progress"] == [0.0, 0.25, 0.5, 0.75]
     assert not list((tmp_path / "store").rglob("*.part"))
+
+
+def test_a_method_may_name_its_types_in_any_way():
+    """Types are text or, without the future import, objects: what a method learns from is known by its parts."""
+    parts = {f.name: (None, f.name) for f in fields(Training)}
+    store = SimpleNamespace(load=lambda ref, output: output)
+    assert stage._load(store, parts) == Training(**{name: name for name in parts})
+    assert stage._load(store, {"run_0": (None, "metrics")}) == {"run_0": "metrics"}
 
 
 def test_memory_cap_is_one_clear_line(tmp_path):

@@ -60,7 +60,7 @@ def rigged_ply(
 ) -> Files:
     """The canonical Gaussians and what moves them, a row of the rig for each Gaussian.
 
-    canonical.ply with its means at ``skinning.rest``, and rig.npz, plain arrays: of the bones weights (N, B) and
+    rigged.ply with its means at ``skinning.rest``, and rig.npz, plain arrays: of the bones weights (N, B) and
     transforms (F, B, 3, 4) on canonical points; of the skeleton joint_names (J,), joint_parents (J,), joints (J, 3),
     joint_weights (N, J), rotations (F, J, 3, 3), translations (F, J, 3), clip_start (C+1,). With an animation the
     transforms are its bones, and are left out for a method that moves none.
@@ -84,7 +84,7 @@ def rigged_ply(
         clip_start=poses.clip_start,
     )
     at_rest = _bytes(replace(gaussians, means=skinning.rest), "ply")
-    return Files.of({f"{FOLDER}/{name}/canonical.ply": at_rest, f"{FOLDER}/{name}/rig.npz": stream.getvalue()})
+    return Files.of({f"{FOLDER}/{name}/rigged.ply": at_rest, f"{FOLDER}/{name}/rig.npz": stream.getvalue()})
 
 
 def _bytes(gaussians: Gaussians, format: str) -> bytes:

@@ -149,10 +149,11 @@ def test_a_rig_goes_with_its_gaussians(tmp_path):
         (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / path).write_bytes(data)
     folder = tmp_path / "export" / "thing"
-    assert np.array_equal(read_ply((folder / "canonical.ply").read_bytes()).means, made.points[0])
+    assert np.array_equal(read_ply((folder / "rigged.ply").read_bytes()).means, made.points[0])
     with np.load(folder / "rig.npz", allow_pickle=False) as rig:
         assert np.array_equal(rig["transforms"], bones)
         assert rig["joint_names"].tolist() == ["a", "b"]
+    assert not (folder / "canonical.ply").exists()  # where the Gaussians' own rest lies: both may be asked for
     few = Skinning(made.points[0][:4], weights[:4], bones, np.zeros(0))
     with pytest.raises(ValueError, match="4 points of the rig"):
         rigged_ply(made, few, skeleton, poses, name="thing")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+from codecs import BOM_UTF8
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal
@@ -121,7 +122,7 @@ def _read(file: Path) -> tuple[np.ndarray, bytes | np.ndarray]:
 
 def _read_obj(file: Path, data: bytes) -> tuple[np.ndarray, bytes]:
     """Own reader: other readers split vertices that carry several texture coordinates, which changes their order."""
-    lines = data.splitlines()
+    lines = data.removeprefix(BOM_UTF8).splitlines()
     rows = [line[2:].split()[:3] for line in lines if line[:2] in (b"v ", b"v\t")]
     try:
         vertices = np.array(rows, dtype="S").astype(np.float64).reshape(len(rows), 3)
@@ -165,10 +166,10 @@ def _triangles(file: Path, topology: bytes | np.ndarray) -> np.ndarray:
     faces = []
     for line in topology.splitlines():
         try:
-            corners = [int(corner.split(b"/")[0]) for corner in line.split()[1:]]
+            corners = [int(corner.split(b"/")[0]) for corner in line.partition(b"#")[0].split()[1:]]
         except ValueError:
             corners = []
-        if len(corners) < 3 or min(corners) < 1:
+        if len(corners) < 3 or min(corners) < 1 or max(corners) >= 2**31:
             found = line.decode("utf-8", "replace")[:80]
             raise InputError(f"{file}: f", expected="three or more vertex numbers from 1", found=found)
         faces += [(corners[0] - 1, b - 1, c - 1) for b, c in pairwise(corners[1:])]

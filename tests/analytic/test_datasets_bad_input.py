@@ -209,6 +209,17 @@ def test_polygons_become_fans(tmp_path):
     assert load(tmp_path).faces.tolist() == [[0, 1, 3], [0, 3, 2], [4, 5, 7]]
 
 
+def test_texts_that_programs_write_differently(tmp_path):
+    """The mark of Windows editors before the first vertex, their line ends, colours behind, remarks."""
+    for k, vertices in enumerate(moving_cube()):
+        lines = [f"v {x} {y} {z} 0.5 0.5 0.5" for x, y, z in vertices]
+        lines += [f"f {a} {b} {c} # remark" for a, b, c in FACES + 1]
+        (tmp_path / f"{k}.obj").write_bytes(b"\xef\xbb\xbf" + "\r\n".join(lines).encode())
+    motion = load(tmp_path)
+    np.testing.assert_array_equal(motion.points, moving_cube())
+    np.testing.assert_array_equal(motion.faces, FACES)
+
+
 def test_topology_that_changes(frames):
     last = frames / "frame12.obj"
     good = last.read_text()
@@ -232,7 +243,7 @@ def test_topology_that_changes(frames):
     rejects(lambda: load(frames), "frame 4, vertex 0")
 
 
-@pytest.mark.parametrize("line", ["f 1 2", "f a b c", "f -1 -2 -3"])
+@pytest.mark.parametrize("line", ["f 1 2", "f a b c", "f -1 -2 -3", "f 1 2 99999999999999999999", "f 1 2 # 3"])
 def test_faces_that_are_none(tmp_path, line):
     for k, vertices in enumerate(moving_cube()):
         (tmp_path / f"{k}.obj").write_text(obj(vertices, FACES[:1]) + line + "\n")

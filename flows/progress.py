@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import threading
 import time
@@ -74,7 +75,14 @@ class Progress:
         self.console.print()
         self._print(f"{how}; {time.monotonic() - self._start:.1f} s; report in {folder}")
 
+    def running(self) -> list[str]:
+        """The stages that workers have begun and not finished."""
+        self._poll()
+        with self._lock:
+            return [f"{stage} ({case})" for stage, case in self._running]
+
     def _line(self, node: Node, how: Text, rest: str) -> None:
+        self._poll()  # or its beginning would be heard of after its end
         with self._lock:
             self._running.pop((node.stage, short(node.cases)), None)
         self.tell(node)
@@ -96,11 +104,15 @@ class Progress:
 
     def _poll(self) -> None:
         with self._lock:
-            try:
-                lines = self._events.read_text("utf-8").splitlines() if self._events else []
-            except OSError:
-                return
-            for line in lines[self._read :]:
+            new = b""
+            with contextlib.suppress(OSError):  # nothing was begun so far
+                if self._events:
+                    with open(self._events, "rb") as file:
+                        file.seek(self._read)
+                        new = file.read()
+            new = new[: new.rfind(b"\n") + 1]
+            self._read += len(new)
+            for line in new.splitlines():
                 event = json.loads(line)
                 running = event["stage"], event["case"]
                 if event["event"] == "progress":
@@ -108,4 +120,3 @@ class Progress:
                     self._running[running] = since, f"{event['fraction']:4.0%} {event['text']}"
                 else:
                     self._running[running] = event["time"], ""
-            self._read = len(lines)

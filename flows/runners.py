@@ -9,6 +9,18 @@ import sys
 from tasks.errors import InputError
 
 
+class WorkerLost(Exception):
+    """A worker process was killed: which stages ran then, and how to go on."""
+
+    def __init__(self, stages: list[str]) -> None:
+        self.stages = stages
+        super().__init__(
+            f"a worker process was killed, from outside or for want of memory, while these stages ran: "
+            f"{'; '.join(stages) or 'none'}; what is finished is kept: the same command goes on from there, with "
+            "runner.workers=1 in less memory"
+        )
+
+
 def task_runner(settings: dict):
     """The task runner of a config's ``runner`` group. Raises InputError if its package is absent."""
     return {"threads": _threads, "processes": _processes, "dask": _dask, "ray": _ray}[settings["kind"]](settings)

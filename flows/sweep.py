@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 import tempfile
+from concurrent.futures import BrokenExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,7 +16,7 @@ from flows.config import Missing
 from flows.costs import Past, chains
 from flows.graph import Graph, Node, short
 from flows.progress import Progress
-from flows.runners import in_flight, task_runner
+from flows.runners import WorkerLost, in_flight, task_runner
 from flows.server import lost, server, watched
 from flows.stage import Job, key_of, run
 from flows.stopping import stoppable
@@ -25,7 +26,7 @@ from tasks.errors import InputError
 if TYPE_CHECKING:
     from flows.reporting import Report
 
-ATTEMPTS = 3  # how often damaged artefacts are dropped and computed again before giving up
+ATTEMPTS = 3  # how often damaged artefacts, or what a killed worker left, are computed again before giving up
 
 
 class StageFailed(Exception):
@@ -46,6 +47,7 @@ def run_batch(batch: Batch, show: bool = True) -> Path:
 
     Raises InputError for bad data and StageFailed for a defect, after every stage that could run has run: what was
     finished stays in the store. Where there is an index, an experiment whose data is bad is left out and says why.
+    What a killed worker left unfinished runs again; raises WorkerLost where workers are killed time and again.
     """
     config = batch.config
     Store(config["store"]["path"])  # a store or a place for reports that cannot be used is said before anything starts
@@ -54,14 +56,28 @@ def run_batch(batch: Batch, show: bool = True) -> Path:
     with stoppable(), server() as ready:
         graph, works = work(batch.experiments, config["report"])
         ready()
-        cases = sum(len(experiment.cases) for experiment in batch.experiments)
-        flow, written = _flow(batch, graph, works, show)
-        try:
-            flow(config["report"]["name"], cases)
-        except Exception:
-            if not (written and lost.is_set()):  # else only the end of the run could not be told to the server
-                raise
-        return written[0]
+        for attempt in range(1, ATTEMPTS + 1):
+            try:
+                return _written_by_flow(batch, graph, works, show)
+            except WorkerLost as error:  # its pool is of no use any more, a new flow has a new one
+                if attempt == ATTEMPTS:
+                    raise
+                if show:
+                    print(
+                        f"a worker was killed while it ran {'; '.join(error.stages)}: what is not finished runs again"
+                    )
+    raise AssertionError("not reached")
+
+
+def _written_by_flow(batch: Batch, graph: Graph, works: list[Work], show: bool) -> Path:
+    """The place of what one run of the flow wrote."""
+    flow, written = _flow(batch, graph, works, show)
+    try:
+        flow(batch.config["report"]["name"], sum(len(experiment.cases) for experiment in batch.experiments))
+    except Exception:
+        if not (written and lost.is_set()):  # else only the end of the run could not be told to the server
+            raise
+    return written[0]
 
 
 def check_place(folder: Path) -> None:
@@ -192,48 +208,54 @@ def compute(graph: Graph, config: dict, progress: Progress) -> Outcome:
 
 
 def _pass(graph: Graph, config: dict, progress: Progress, outcome: Outcome) -> None:
-    """One walk over the graph: a node is submitted when its inputs are there, so no worker waits for another, and first
-    the one that begins the longest chain, so that no long stage is left to the end. Where nobody can look at Prefect's
-    pages, what is cached is taken at once, without a task run of its own."""
-    from prefect.futures import as_completed
-
-    task = stage_task()
-    waiting = [n for n in graph.nodes.values() if n.id not in outcome.refs and n.id not in outcome.errors]
-    store, shown = Store(config["store"]["path"]), watched()
-    past = Past(store)
+    """Hands every stage to a worker as soon as its inputs are there, so no worker waits for another, and first
+    the one that begins the longest chain, so that no long stage is left to the end. Raises WorkerLost."""
+    past = Past(Store(config["store"]["path"]))
     first = chains(graph, {n.id: past.seconds(n) for n in graph.nodes.values()})
+    waiting = [n for n in graph.nodes.values() if n.id not in outcome.refs and n.id not in outcome.errors]
     waiting.sort(key=lambda n: -first[n.id])
-    most = in_flight(config["runner"])
-    running: dict[object, Node] = {}
-    futures: dict[str, object] = {}
     with tempfile.TemporaryDirectory(prefix="skelebones-") as folder, stoppable(folder):
         events = str(Path(folder) / "events.jsonl")
         progress.follow(events)
-        while waiting or running:
-            found = False
-            for node in [n for n in waiting if all(u.id in outcome.refs for u in n.upstream())]:
-                if len(running) >= most:
-                    break
-                waiting.remove(node)
-                job = job_of(node, outcome.refs, config, events)
-                cached = None if shown else store.find(job.stage, key_of(job))
-                if cached:
-                    found = True
-                    outcome.refs[node.id] = cached
-                    progress.done(node, cached)
-                    continue
-                title = f"{node.title}: {short(node.cases)}".replace("{", "{{").replace("}", "}}")  # Prefect formats it
-                named = task.with_options(name=node.stage, task_run_name=title)
-                future = named.submit(job, wait_for=[futures[u.id] for u in node.upstream() if u.id in futures])
-                running[future] = node
-                futures[node.id] = future
-            if found:
-                continue  # what stands behind them may be ready now
-            if not running:
-                return  # what still waits stands behind a failure
-            future = next(iter(as_completed(list(running))))
-            node = running.pop(future)
-            _collect(future, node, outcome, progress)
+        try:
+            _hand_out(waiting, config, events, progress, outcome)
+        except BrokenExecutor as error:
+            raise WorkerLost(progress.running()) from error
+
+
+def _hand_out(waiting: list[Node], config: dict, events: str, progress: Progress, outcome: Outcome) -> None:
+    """Runs the stages in the order given, each once what it needs is there. Where nobody can look at Prefect's pages,
+    what is cached is taken at once, without a task run of its own."""
+    from prefect.futures import as_completed
+
+    task, store, shown = stage_task(), Store(config["store"]["path"]), watched()
+    most = in_flight(config["runner"])
+    running: dict[object, Node] = {}
+    futures: dict[str, object] = {}
+    while waiting or running:
+        found = False
+        for node in [n for n in waiting if all(u.id in outcome.refs for u in n.upstream())]:
+            if len(running) >= most:
+                break
+            waiting.remove(node)
+            job = job_of(node, outcome.refs, config, events)
+            cached = None if shown else store.find(job.stage, key_of(job))
+            if cached:
+                found = True
+                outcome.refs[node.id] = cached
+                progress.done(node, cached)
+                continue
+            title = f"{node.title}: {short(node.cases)}".replace("{", "{{").replace("}", "}}")  # Prefect formats it
+            named = task.with_options(name=node.stage, task_run_name=title)
+            future = named.submit(job, wait_for=[futures[u.id] for u in node.upstream() if u.id in futures])
+            running[future] = node
+            futures[node.id] = future
+        if found:
+            continue  # what stands behind them may be ready now
+        if not running:
+            return  # what still waits stands behind a failure
+        future = next(iter(as_completed(list(running))))
+        _collect(future, running.pop(future), outcome, progress)
 
 
 def _collect(future, node: Node, outcome: Outcome, progress: Progress) -> None:

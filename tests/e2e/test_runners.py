@@ -6,8 +6,12 @@ import importlib.util
 import os
 import subprocess
 import sys
+import threading
+import time
+from glob import glob
 from pathlib import Path
 
+import psutil
 import pytest
 
 from flows.batch import batch
@@ -51,6 +55,25 @@ def test_every_runner_gives_the_same_metrics(kind, tmp_path, prefect_server, sma
     need(kind)
     monkeypatch.setenv("PYTHONPATH", str(ROOT))  # for worker processes
     assert sweep(small_file, tmp_path, f"runner={kind}") == threads
+
+
+@pytest.mark.skipif(os.name != "posix", reason="kill -9 is POSIX's")
+def test_a_worker_killed_in_mid_sweep_changes_nothing(tmp_path, prefect_server, small_file, threads, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    killed = []
+
+    def kill() -> None:
+        """Kills a worker once some stages are in the store."""
+        while len(glob(f"{tmp_path}/store/*/*/meta.json")) < 8:
+            time.sleep(0.05)
+        workers = [c for c in psutil.Process().children(recursive=True) if "spawn_main" in "".join(c.cmdline())]
+        workers[0].kill()
+        killed.append(workers[0].wait(60))
+
+    killer = threading.Thread(target=kill, daemon=True)
+    killer.start()
+    assert sweep(small_file, tmp_path, "runner=processes") == threads
+    assert len(killed) == 1
 
 
 def test_workers_that_run_already_share_a_store(tmp_path, prefect_server, small_file, threads):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import fields
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,7 +13,7 @@ import pytest
 from flows import source, stage
 from flows.graph import Graph, short
 from flows.progress import Progress
-from flows.runners import task_runner
+from flows.runners import WorkerLost, task_runner
 from flows.stage import Job, key_of, run
 from flows.store import CorruptArtefact, Store
 from flows.sweep import StageFailed, check_place, compute, raise_first
@@ -106,6 +107,20 @@ def test_equal_content_upstream_re_runs_nothing_after_it(world):
     world.bodies()
     world.run(world.graph(4.0))  # its sign is the same as that of 3
     assert sorted(world.bodies()) == ["double", "make 4.0", "sign"]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name != "posix", reason="kill -9 is POSIX's")
+def test_a_killed_worker_is_named_and_the_next_run_goes_on(tmp_path, prefect_server, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(source.ROOT))  # for worker processes
+    world = World(tmp_path, "processes")
+    with pytest.raises(WorkerLost, match=r"fatal \(case 3.0\).*the same command goes on") as caught:
+        world.run(world.graph(3.0, tail="fatal"))
+    assert caught.value.stages == ["fatal (case 3.0)"]
+    assert sorted(world.bodies()) == ["double", "double", "fatal", "make 3.0", "sign"]
+    (tmp_path / "log.txt").write_text("fatal\n")
+    assert world.run(world.graph(3.0, tail="fatal")).computed
+    assert world.bodies() == ["fatal", "fatal"]
 
 
 def test_changed_setting_re_runs_only_what_follows(world):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import time
 from pathlib import Path
 
@@ -68,6 +69,15 @@ def refuse(source: Metrics, *, path: str, log: str) -> Metrics:
     """A stage that finds its input bad."""
     _log(log, "refuse")
     raise InputError(str(Path(path).name), expected="something good", found="something bad", do="mend it")
+
+
+def fatal(source: Metrics, *, log: str) -> Metrics:
+    """A stage whose worker is killed, the first time it runs."""
+    _log(log, "fatal")
+    with open(log, encoding="utf-8") as file:
+        if file.read().split().count("fatal") == 1:
+            os.kill(os.getpid(), signal.SIGKILL)
+    return source
 
 
 def long(source: Metrics, *, log: str, die_at: int, workspace: Workspace) -> Metrics:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from omegaconf import OmegaConf
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
 UNSEEN = ("rmse_pct", "rmse", "rmse_coordinate")
 MOTION = ("velocity_rmse", "speed_ratio", "max_error")
 CONFIDENCE = ("confidence_spearman", "outside_pct")
+DISTANCE = "query_distance"
 LEFT_OUT = ("rmse_spread", "rmse_left_out", "rmse_left_out_spread")
 VIEWS = ("psnr", "ssim", "flip", "lpips", "ssim_down")
 PATHS = ("path_pct", "path_start_pct")
@@ -66,6 +68,11 @@ OTHER_WAYS = tuple(f"by {way}" for way in JOINTS)  # ends of the rows' names tha
 ON_CONFIDENCE = (
     "Expected from a pose's distance to the database alone, calibrated by leaving training clips out: how well it "
     "ranks the frames by the error that each row makes there. Outside: farther off than 95 % of those."
+)
+BY_PART = "Distance of the unseen poses from the database, by clip and part"
+ON_DISTANCE = (
+    "Mean over a part's joints of the angle to the nearest windows of the training clips; differences of the root's "
+    "gravity and motion count as angles too, by the weight confidence.dynamics. It is the same for all methods."
 )
 ON_LEFT_OUT = (
     "Trained {runs} times, each time without one training clip: how far that moves the error on the unseen clips, and "
@@ -130,12 +137,27 @@ def _result_tables(cases: list[Case], rows, settings: dict, notes: list[str], pa
         tables.append(build(rows, title="Motion of the same results", metrics=MOTION, notes=[], **common))
     if has & set(CONFIDENCE):
         tables.append(build(rows, title="Confidence", metrics=CONFIDENCE, notes=[ON_CONFIDENCE], **plain))
+    tables += _distance_tables(cases, rows, plain)
     if has & set(LEFT_OUT):
         notes = [ON_LEFT_OUT.format(runs=cases[0].config["evaluate"]["left_out"])]
         tables.append(build(rows, title="One training clip left out", metrics=LEFT_OUT, notes=notes, **plain))
     if has & set(PATHS):
         tables.append(build(with_means(rows), title="Paths of the Gaussians", metrics=PATHS, notes=[], **common))
     return tables
+
+
+def _distance_tables(cases: list[Case], rows, common: dict) -> list:
+    """How far the unseen poses lie from the database, by clip and part; it is the same for all methods. Only of data
+    whose skeleton is given: joints found by us have no names that say something."""
+    from tasks.evaluation.tables import build, unranked
+
+    given = {c.dataset for c in cases if c.config["skeleton"]["kind"] == "given"}
+    found = rows[rows["metric"].str.startswith(f"{DISTANCE}@") & rows["dataset"].isin(given)]
+    found = _by_case(found.drop_duplicates(["dataset", "subject", "metric"])).assign(variant="")
+    if found.empty:
+        return []
+    made = unranked(build(found, title=BY_PART, metrics=[DISTANCE], notes=[ON_DISTANCE], **common | {"labels": {}}))
+    return [replace(made, folded=True)]
 
 
 def _rig_tables(cases: list[Case], rows, remarks: list[str], common: dict) -> list:

@@ -42,10 +42,10 @@ class Report:
 
     @property
     def shown(self) -> list:
-        """The tables for the terminal."""
+        """The tables for the terminal, without details."""
         from tasks.evaluation import typeset
 
-        return [typeset.terminal(t) for t in self.tables]
+        return [typeset.terminal(t) for t in self.tables if not t.folded]
 
     @property
     def line(self) -> str:

@@ -14,16 +14,19 @@ FAR = 0.95  # share of training frames beyond which a pose counts as outside
 
 def evaluate_confidence(confidence: Confidence, animation: Animation, test: Motion) -> Metrics:
     """Rank correlation (Spearman) of the expected error with the result's own, frame by frame, and how much of the test
-    lies outside the database; the mean share of training frames that had less to fear also clip by clip. Nothing where
-    one training clip left nothing to judge by."""
-    if not confidence.expected.any():
-        return Metrics((), (), np.zeros(0))
-    true = frame_rmse(animation.points, test.points)
-    found = {"outside_pct": 100.0 * float(np.mean(confidence.outside > FAR))}
-    if np.ptp(true) > 0 and np.ptp(confidence.expected) > 0:
-        found["confidence_spearman"] = float(np.corrcoef(rankdata(confidence.expected), rankdata(true))[0, 1])
-    for key, clip in zip(clip_keys(test.clip_names), test.clips(), strict=True):
-        found[f"outside_pct@{key}"] = 100.0 * float(np.mean(confidence.outside[clip] > FAR))
+    lies outside the database, as a whole and clip by clip; these are left out where one training clip left nothing to
+    judge by. By clip and part, how far the poses lie from the database: "query_distance@clip, part" in degrees."""
+    found: dict[str, float] = {}
+    clips = list(zip(clip_keys(test.clip_names), test.clips(), strict=True))
+    if confidence.expected.any():
+        true = frame_rmse(animation.points, test.points)
+        found["outside_pct"] = 100.0 * float(np.mean(confidence.outside > FAR))
+        if np.ptp(true) > 0 and np.ptp(confidence.expected) > 0:
+            found["confidence_spearman"] = float(np.corrcoef(rankdata(confidence.expected), rankdata(true))[0, 1])
+        found |= {f"outside_pct@{key}": 100.0 * float(np.mean(confidence.outside[clip] > FAR)) for key, clip in clips}
+    for key, clip in clips:
+        angles = np.degrees(confidence.distance[clip].mean((0, 2), dtype=np.float64))
+        found |= {f"query_distance@{key}, {part}": float(a) for part, a in zip(confidence.parts, angles, strict=True)}
     return declared(found, test.unit)
 
 

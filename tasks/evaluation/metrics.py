@@ -26,7 +26,18 @@ class Metric:
 
     label: str
     kind: Literal[
-        "length", "speed", "percent", "ratio", "count", "decibel", "hours", "seconds", "milliseconds", "rate", "memory"
+        "length",
+        "speed",
+        "percent",
+        "ratio",
+        "count",
+        "decibel",
+        "hours",
+        "seconds",
+        "milliseconds",
+        "rate",
+        "memory",
+        "angle",
     ]
     better: Literal["lower", "higher", "one", "none"]
     text: str
@@ -46,6 +57,9 @@ METRICS: dict[str, Metric] = {
     ),
     "outside_pct": Metric(
         "outside", "percent", "none", "unseen frames farther off than 95 % of left-out training ones", 1
+    ),
+    "query_distance": Metric(
+        "distance to the database", "angle", "none", "mean over frames and their nearest windows, one part's joints", 1
     ),
     "rmse_spread": Metric("± clip left out", "length", "none", "standard deviation of RMSE, one training clip missing"),
     "rmse_left_out": Metric("RMSE, clips left out", "length", "lower", "mean over training clips, each unseen"),
@@ -139,6 +153,7 @@ METRICS: dict[str, Metric] = {
 }
 
 _FIXED_UNITS = {
+    "angle": "deg",
     "percent": "%",
     "ratio": "ratio",
     "count": "count",

@@ -87,12 +87,13 @@ class Grid:
 
 @dataclass(frozen=True)
 class Table:
-    """rows: their labels; notes: remarks on the whole table."""
+    """rows: their labels; notes: remarks on the whole table; folded: a detail that a page opens when asked to."""
 
     title: str
     columns: tuple[Column, ...]
     rows: tuple[str, ...]
     notes: tuple[str, ...] = ()
+    folded: bool = False
 
     @property
     def remarks(self) -> list[str]:

@@ -62,7 +62,10 @@ def markdown(table: Table) -> str:
 
     grids = [grid(part) for part in table.grids()]
     marks = [f"<sup>{i}</sup> {note}." for i, note in enumerate(footnotes, start=1)]
-    return "\n\n".join([f"**{table.title}**", *grids, *table.remarks, *marks]) + "\n"
+    whole = [f"**{table.title}**", *grids, *table.remarks, *marks]
+    if table.folded:
+        whole = ["<details>", f"<summary>{escape(table.title)}</summary>", *whole[1:], "</details>"]
+    return "\n\n".join(whole) + "\n"
 
 
 _LATEX = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
@@ -112,7 +115,12 @@ def latex(table: Table) -> str:
 _HTML = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(
     """\
 <figure class="table">
+{% if table.folded %}
+<details>
+<summary>{{ table.title }}</summary>
+{% else %}
 <figcaption>{{ table.title }}</figcaption>
+{% endif %}
 {% for grid in table.grids() %}
 {% if grid.title %}
 <p class="grid">{{ grid.title }}</p>
@@ -147,6 +155,9 @@ _HTML = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_
 <p><sup>{{ loop.index }}</sup> {{ note }}.</p>
 {% endfor %}
 </div>
+{% if table.folded %}
+</details>
+{% endif %}
 </figure>
 """
 )

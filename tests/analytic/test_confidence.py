@@ -60,6 +60,8 @@ def test_its_rank_correlation_is_reported_and_files_name_the_sources(train):
     named = dict(zip(*(lambda m: (m.names, m.values))(evaluate_confidence(found, Animation(off), test)), strict=True))
     assert named["confidence_spearman"] == pytest.approx(1.0, abs=1e-3)  # float32 points
     assert {"outside_pct", "outside_pct@clip0", "outside_pct@clip1"} < set(named)
+    apart = [named[f"query_distance@clip1, {part}"] for part in found.parts]
+    np.testing.assert_allclose(apart, np.degrees(found.distance[30:].mean((0, 2))), rtol=1e-5)
     text = bytes(confidence_file(found, test, train.motion, name="planted").content).decode().splitlines()
     assert len(text) == 1 + 50 * len(train.parts.names)
     first = dict(zip(text[0].split(","), text[1].split(","), strict=True))
@@ -98,7 +100,8 @@ def test_one_clip_leaves_nothing_to_judge_by(train):
     alone = planted.training(CLIPS[:1])
     found = confidence(alone, planted.poses(CLIPS[1:2]), **SETTINGS)
     assert not found.expected.any()
-    assert evaluate_confidence(found, Animation(train.motion.points[60:120]), train.motion.take_clips([1])).names == ()
+    said = evaluate_confidence(found, Animation(train.motion.points[60:120]), train.motion.take_clips([1])).names
+    assert all(name.startswith("query_distance@") for name in said)
 
 
 def test_clips_shorter_than_a_patch_are_padded(train):

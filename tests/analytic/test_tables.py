@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -300,6 +301,17 @@ def test_terminal_shows_every_number_once_a_subject(full):
     text = " ".join(out.getvalue().split())  # titles wrap in narrow grids
     for word in ("17.0", "30.0", "printed in the paper, not run", "33.7", "ours, substitute"):
         assert word in text
+
+
+def test_a_detail_is_folded_on_a_page(full):
+    folded = replace(full, folded=True)
+    parser = _Cells()
+    parser.feed(typeset.html(folded))
+    assert parser.open == []
+    assert "<summary>T</summary>" in typeset.html(folded)
+    text = typeset.markdown(folded)
+    assert text.startswith("<details>\n\n<summary>T</summary>\n\n")
+    assert text.endswith("\n\n</details>\n")
 
 
 def test_footnotes_are_numbered_in_reading_order(full):

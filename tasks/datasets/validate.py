@@ -21,6 +21,7 @@ from tasks.values import About, Motion, Rig
 
 LEAST_POINTS = 4  # three points and a frame of reference: below this no rigid transform is defined
 RIG_NOTED = 1e-3  # of the diagonal
+SIZES = 1e-5, 1e9  # of a shape's diagonal: outside, small absolute numbers and float32's squares would decide results
 STILL = 1e-6  # of the diagonal: float32 cannot hold a motion smaller than this
 COARSE = 1e-3  # of the diagonal: a step between neighbouring float32 numbers that would show
 # what numpy and zipfile raise for damaged, encrypted or foreign archives (NotImplementedError is a RuntimeError)
@@ -96,8 +97,8 @@ def motion(
     """A Motion whose every field has been checked. where: the file, for messages. Without clips it is one clip.
 
     Raises InputError for wrong shapes and types, NaN or infinite coordinates, a shape so far from the origin that
-    float32 loses it, faces out of range, malformed clips, fewer than two frames or four points, and a sequence that
-    does not move.
+    float32 loses it, one too small or too large to be computed with, faces out of range, malformed clips, fewer than
+    two frames or four points, and a sequence that does not move.
     """
     points = real(f"{where}: vertices", points, shape="(frames, points, 3)", last=3)
     _check(len(points) >= 2, f"{where}: vertices", "at least 2 frames", len(points), "give a moving sequence")
@@ -281,6 +282,8 @@ def _resolved(where: str, points: np.ndarray) -> None:
 def _moves(where: str, points: np.ndarray) -> None:
     size = max(diagonal(points[0]), diagonal(points[-1]))
     _check(size > 0, f"{where}: vertices", "points apart from each other", "all points in one place")
+    expected = f"a shape {SIZES[0]:g} to {SIZES[1]:g} units across"
+    _check(SIZES[0] <= size <= SIZES[1], f"{where}: vertices", expected, f"{size:.3g}", "scale all coordinates")
     if _largest_shift(points) <= STILL * size:
         raise InputError(
             f"{where}: vertices",

@@ -77,6 +77,8 @@ BAD_ARRAYS = {
     "complex": ({"vertices": moving_cube() * 1j}, ("real numbers", "complex")),
     "pickled": ({"vertices": np.array([CUBE, None], dtype=object)}, ("vertices", "pickled", "never loaded")),
     "far from the origin": ({"vertices": moving_cube() + 1e6}, ("origin", "1e+06", "subtract the centre")),
+    "too small": ({"vertices": moving_cube() * np.float32(1e-7)}, ("1e-05 to 1e+09 units", "scale all coordinates")),
+    "too large": ({"vertices": moving_cube() * np.float32(1e12)}, ("1e-05 to 1e+09 units", "scale all coordinates")),
     "still": ({"vertices": np.repeat(CUBE[None], 5, 0)}, ("moving", "5 frames")),
     "all in one place": ({"vertices": np.zeros((5, 8, 3)) + np.arange(5)[:, None, None]}, ("one place",)),
     "face out of range": ({"faces": np.vstack([FACES, [[0, 1, 8]]])}, ("0 to 7", "[0, 1, 8]", "face 12")),

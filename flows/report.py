@@ -164,7 +164,7 @@ def _read(folder: Path) -> tuple[dict[tuple[str, ...], tuple[float, str]], dict]
 def _moved_table(moved: list[Moved]) -> Table:
     table = Table()
     for name in ("data", "method", "metric"):
-        table.add_column(name)
+        table.add_column(name, overflow="fold")  # a metric whose clip is cut off could be any
     for name in ("A", "B", "change"):
         table.add_column(name, justify="right")
     for m in moved:

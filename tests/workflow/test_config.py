@@ -9,7 +9,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from flows import config, ranges, schema, source
+from flows import config, ranges, run, schema, source
 from flows.source import ROOT
 from tasks.errors import InputError
 
@@ -244,6 +244,13 @@ def test_a_whole_number_may_stand_for_a_number_and_nothing_else_is_converted():
     for wrong in ({"a": True}, {"a": "1"}, {"b": 1.5}, {"c": [[1]]}):
         with pytest.raises(InputError):
             schema.check({"a": 1, "b": 2, "c": []} | wrong, expected)
+
+
+def test_a_number_out_of_range_is_refused_before_anything_is_begun(tmp_path, capsys):
+    store = tmp_path / "store"
+    assert run.main(["animate.k=0", f"store.path={store}"]) == 2
+    assert capsys.readouterr().err == "error: animate.k: expected a whole number, 1 or more, found 0\n"
+    assert not store.exists()
 
 
 @pytest.mark.parametrize(

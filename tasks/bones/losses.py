@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from tasks.bones.simplex import solve
-from tasks.bones.simplex import value as value_of
 from tasks.bones.trajectories import Trajectories
 from tasks.bones.weights import POINTS, TILE, Forms, best_bone, bring_in, correlate, products_of, quadratic_form
 from tasks.geometry.parallel import for_chunks
+from tasks.geometry.simplex import solve
+from tasks.geometry.simplex import value as value_of
 
 
 def losses(paths: Trajectories, bones: Forms, index: np.ndarray, value: np.ndarray) -> np.ndarray:

@@ -17,10 +17,10 @@ from numba import njit
 
 from tasks.bones.graph import Graph, alone
 from tasks.bones.products import product
-from tasks.bones.simplex import solve
-from tasks.bones.simplex import value as value_of
 from tasks.bones.trajectories import Trajectories
 from tasks.geometry.parallel import for_chunks
+from tasks.geometry.simplex import solve
+from tasks.geometry.simplex import value as value_of
 
 POINTS = 512  # points a thread takes at a time
 TILE = 8  # points whose correlations with all bones are computed together

@@ -7,9 +7,9 @@ from numba import njit
 
 from tasks.geometry.moments import homogeneous
 from tasks.geometry.parallel import for_chunks
+from tasks.geometry.simplex import solve, value
 
 CHUNK = 512
-_RIDGE = 1e-9
 
 
 def fit_weights(
@@ -162,53 +162,13 @@ def _drop_one(q: np.ndarray, support: np.ndarray, values: np.ndarray, size: int)
 
 @njit(cache=True, nogil=True)
 def _descend(q: np.ndarray, support: np.ndarray, values: np.ndarray, size: int) -> tuple[int, float]:
-    """Minimum of w^T q w over the simplex on ``support``: solve with the sum fixed, drop the most negative, repeat."""
-    while True:
-        w = _solve_ones(q, support, size)
-        w /= w.sum()
-        worst = 0
-        for i in range(size):
-            if w[i] < w[worst]:
-                worst = i
-        if w[worst] > 0.0 or size == 1:
-            break
-        for i in range(worst, size - 1):
-            support[i] = support[i + 1]
-        size -= 1
-    error = 0.0
+    """Minimum of w^T q w over the simplex on ``support``, from the values; from their mean where they are nought."""
+    few, total = np.empty((size, size)), 0.0
     for i in range(size):
-        values[i] = w[i]
+        total += values[i]
         for j in range(size):
-            error += w[i] * w[j] * q[support[i], support[j]]
-    return size, error
-
-
-@njit(cache=True, nogil=True)
-def _solve_ones(q: np.ndarray, support: np.ndarray, size: int) -> np.ndarray:
-    """Solves q[support, support] w = 1 by Cholesky; pivots are floored, since two bones may move alike."""
-    floor = 0.0
+            few[i, j] = q[support[i], support[j]]
     for i in range(size):
-        floor += _RIDGE * abs(q[support[i], support[i]])
-    floor += 1e-300
-    low = np.zeros((size, size))
-    w = np.ones(size)
-    for i in range(size):
-        for j in range(i + 1):
-            total = q[support[i], support[j]]
-            if i == j:
-                total += floor
-            for k in range(j):
-                total -= low[i, k] * low[j, k]
-            if i == j:
-                low[i, i] = np.sqrt(max(total, floor))
-            else:
-                low[i, j] = total / low[j, j]
-    for i in range(size):
-        for k in range(i):
-            w[i] -= low[i, k] * w[k]
-        w[i] /= low[i, i]
-    for i in range(size - 1, -1, -1):
-        for k in range(i + 1, size):
-            w[i] -= low[k, i] * w[k]
-        w[i] /= low[i, i]
-    return w
+        values[i] = values[i] / total if total > 0.0 else 1.0 / size
+    size = solve(few, support, values, size)
+    return size, value(few, values, size)

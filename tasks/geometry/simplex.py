@@ -59,7 +59,7 @@ def _interior(q, goal, matrix, size):
         for r in range(n):
             matrix[s, r] = q[s + 1, r + 1] - q[s + 1, 0] - q[0, r + 1] + q[0, 0]
         goal[s + 1] = q[0, 0] - q[s + 1, 0]
-        trace += matrix[s, s]
+        trace += abs(matrix[s, s])  # of bones that move alike rounding may leave less than nothing
     ridge = _RIDGE * trace / n + 1e-300
     for s in range(n):
         matrix[s, s] += ridge

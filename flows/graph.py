@@ -13,6 +13,7 @@ from pathlib import Path
 
 from flows import source
 from flows.store import canonical_json
+from tasks.errors import InputError
 
 
 @dataclass
@@ -107,8 +108,16 @@ def union(graphs: list[Graph]) -> Graph:
 
 
 def digest_of_files(path: str) -> str:
-    """Digest of a file, or of all files of a folder with their names; "absent" if there is nothing."""
-    root = Path(path).expanduser()
+    """Digest of a file, or of all files of a folder with their names; "absent" if there is nothing. Raises InputError
+    for files that cannot be read or that vanish meanwhile."""
+    try:
+        return _digest_of_files(Path(path).expanduser())
+    except OSError as error:
+        found = f"{error.strerror} ({Path(error.filename or path).name})"
+        raise InputError(path, expected="files that can be read", found=found, do="check permissions") from None
+
+
+def _digest_of_files(root: Path) -> str:
     files = sorted(p for p in root.rglob("*") if p.is_file()) if root.is_dir() else [root]
     total = hashlib.sha256()
     for file in files:

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 
 from flows import source, stage
-from flows.graph import Graph, short
+from flows.graph import Graph, digest_of_files, short
 from flows.progress import Progress
 from flows.runners import WorkerLost, task_runner
 from flows.stage import Job, key_of, run
@@ -255,6 +255,18 @@ def test_long_stage_goes_on_from_its_workspace(tmp_path):
     told = [json.loads(line) for line in (tmp_path / "events.jsonl").read_text().splitlines()]
     assert [e["fraction"] for e in told if e["event"] == "progress"] == [0.0, 0.25, 0.5, 0.75]
     assert not list((tmp_path / "store").rglob("*.part"))
+
+
+def test_data_that_may_not_be_read_is_one_line(tmp_path, monkeypatch):
+    (tmp_path / "own.npz").write_bytes(b"1")
+
+    def refuse(file, *_):
+        raise PermissionError(13, "Permission denied", str(file))
+
+    monkeypatch.setattr("builtins.open", refuse)
+    for path in (tmp_path, tmp_path / "own.npz"):
+        with pytest.raises(InputError, match=r"Permission denied \(own\.npz\)"):
+            digest_of_files(str(path))
 
 
 def test_a_method_may_name_its_types_in_any_way():

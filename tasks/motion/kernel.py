@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
+from numba import njit
 from scipy.linalg import cho_factor, cho_solve
 
 WIDTHS, RIDGES = (0.5, 1.0, 2.0, 4.0), (0.1, 1.0, 10.0)  # multiples of the settings that are tried
@@ -24,7 +25,7 @@ class Ridge:
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """(F, D) -> (F, Y)."""
-        return self.mean + matern(squared_distances(x, self.centres) / self.width**2) @ self.coefficients
+        return self.mean + correlation(x, self.centres, self.width) @ self.coefficients
 
 
 def fit(
@@ -62,14 +63,30 @@ def fit(
             chosen = _landmarks(len(x), landmarks)
     centres = x[chosen]
     mean = y.mean(0) if centred else np.zeros(y.shape[1])
-    inner = matern(squared_distances(centres, centres) / scale**2)
+    left, right = correlation(centres, centres, scale), y - mean
     if len(chosen) == len(x):
-        left, right = inner + ridge * np.eye(len(x)), y - mean
+        left[np.diag_indices_from(left)] += ridge
     else:
-        cross = matern(squared_distances(centres, x) / scale**2)
-        left, right = cross @ cross.T + ridge * inner, cross @ (y - mean)
+        cross = correlation(centres, x, scale)
+        left, right = cross @ cross.T + ridge * left, cross @ right
     left[np.diag_indices_from(left)] += JITTER * np.trace(left) / len(left)
-    return Ridge(centres, cho_solve(cho_factor(left), right), mean, scale)
+    factor = cho_factor(left.T, overwrite_a=True)  # symmetric: transposed it is as LAPACK wants it
+    return Ridge(centres, cho_solve(factor, right), mean, scale)
+
+
+def correlation(a: np.ndarray, b: np.ndarray, scale: float) -> np.ndarray:
+    """matern(squared_distances(a, b) / scale^2) in one pass over memory. (M, D), (N, D) -> (M, N)."""
+    out = a @ b.T
+    _correlate((a * a).sum(1), (b * b).sum(1), 3.0 / scale**2, out)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _correlate(a, b, factor, products):
+    for m in range(len(a)):
+        for n in range(len(b)):
+            r = np.sqrt(factor * max(a[m] + b[n] - 2.0 * products[m, n], 0.0))
+            products[m, n] = (1.0 + r) * np.exp(-r)
 
 
 def matern(squared: np.ndarray) -> np.ndarray:
@@ -83,30 +100,32 @@ def squared_distances(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.maximum((a * a).sum(1)[:, None] + (b * b).sum(1) - 2.0 * a @ b.T, 0.0)
 
 
-def left_out_errors(
-    inverse: np.ndarray, y: np.ndarray, clip: np.ndarray, centred: bool, asked: int | None = None
-) -> float:
-    """Sum of squared errors of the regression on every clip when trained without it, in closed form; of the first
-    ``asked`` rows alone where given.
+def inverted(gram: np.ndarray) -> np.ndarray:
+    """The inverse of a positive definite matrix."""
+    return cho_solve(cho_factor(gram), np.eye(len(gram)))
+
+
+def left_out(inverse: np.ndarray, y: np.ndarray, clip: np.ndarray, *, centred: bool) -> np.ndarray:
+    """Errors (F, Y) of the regression on every clip when trained without it, in closed form.
 
     inverse: Q = (K + ridge I)^-1; leaving a block c out leaves the error Q_cc^-1 (Q (y - m))_c, m the mean of the rest.
     """
-    total = 0.0
+    errors = np.empty_like(y)
     for c in np.unique(clip):
         mine = clip == c
         mean = y[~mine].mean(0) if centred else np.zeros(y.shape[1])
-        error = np.linalg.solve(inverse[np.ix_(mine, mine)], inverse[mine] @ (y - mean))
-        total += float((error[np.flatnonzero(mine) < (len(y) if asked is None else asked)] ** 2).sum())
-    return total
+        errors[mine] = np.linalg.solve(inverse[np.ix_(mine, mine)], inverse[mine] @ (y - mean))
+    return errors
 
 
 def _best(apart: np.ndarray, y: np.ndarray, clip: np.ndarray, width: float, ridge: float) -> tuple[float, float, bool]:
     best = (np.inf, width, ridge, True)
     for w, r in product(WIDTHS, RIDGES):
         gram = matern(apart / (width * w) ** 2) + ridge * r * np.eye(len(apart))
-        inverse = cho_solve(cho_factor(gram), np.eye(len(gram)))
+        inverse = inverted(gram)
         for centred in (True, False):
-            best = min(best, (left_out_errors(inverse, y, clip, centred), width * w, ridge * r, centred))
+            error = float((left_out(inverse, y, clip, centred=centred) ** 2).sum())
+            best = min(best, (error, width * w, ridge * r, centred))
     return best[1:]
 
 
@@ -120,6 +139,6 @@ def _gains(x, y, x_both, y_both, clip, scale, ridge, centred, landmarks) -> bool
     errors = []
     for a, b, rows in ((x, y, some), (x_both, y_both, np.concatenate([some, len(x) + some]))):
         gram = matern(squared_distances(a[rows], a[rows]) / scale**2) + ridge * np.eye(len(rows))
-        inverse = cho_solve(cho_factor(gram), np.eye(len(gram)))
-        errors.append(left_out_errors(inverse, b[rows], clip[rows % len(x)], centred, len(some)))
+        wrong = left_out(inverted(gram), b[rows], clip[rows % len(x)], centred=centred)[: len(some)]
+        errors.append(float((wrong**2).sum()))
     return errors[1] < errors[0]

@@ -65,9 +65,13 @@ class Posed:
     @cached_property
     def dynamics(self) -> np.ndarray:
         """(F, 4, 3) gravity, velocity, acceleration and angular velocity of the root, weighted to be compared."""
-        size = diagonal(self.training.canonical.points)
         pivot = self.training.skeleton.joints[self.root].astype(np.float64)
-        moving = root_dynamics(self.world[:, self.root], pivot, self.poses.clip_start, self.training.database.fps)
+        return self.moving(self.world[:, self.root], pivot)
+
+    def moving(self, transforms: np.ndarray, pivot: np.ndarray) -> np.ndarray:
+        """The same (F, 4, 3) of anything that moves rigidly by (F, 3, 4), at the point that rests at ``pivot``."""
+        size = diagonal(self.training.canonical.points)
+        moving = root_dynamics(transforms, pivot, self.poses.clip_start, self.training.database.fps)
         return moving * (DYNAMICS / np.array([1.0, size, size, 1.0]))[:, None]
 
     @cached_property

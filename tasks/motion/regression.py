@@ -34,7 +34,12 @@ def features(posed: Posed, joints: np.ndarray, weights: np.ndarray, *, dynamics:
     heavy = np.sqrt(weights / (2.0 * weights.sum()))[:, None, None]
     turns = (heavy * posed.poses.rotations[:, joints]).reshape(len(posed.world), -1)
     now = np.concatenate([turns, dynamics * posed.dynamics.reshape(len(turns), -1)], axis=1)
-    back = [np.maximum(np.arange(b - a)[:, None] - np.array(lags), 0) + a for a, b in pairwise(posed.poses.clip_start)]
+    return with_past(now, posed.poses.clip_start, lags)
+
+
+def with_past(now: np.ndarray, clip_start: np.ndarray, lags: list[int]) -> np.ndarray:
+    """(F, D) -> (F, L D) each frame beside what was ``lags`` frames ago (before a clip's first frame: that frame)."""
+    back = [np.maximum(np.arange(b - a)[:, None] - np.array(lags), 0) + a for a, b in pairwise(clip_start)]
     return now[np.concatenate(back)].reshape(len(now), -1) / np.sqrt(len(lags))
 
 

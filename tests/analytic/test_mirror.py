@@ -9,7 +9,7 @@ import pytest
 
 from tasks.geometry.measure import vertex_rmse
 from tasks.geometry.skinning import skin
-from tasks.methods import mlp, part_kernel
+from tasks.methods import bone_kernel, mlp, part_kernel
 from tasks.motion.database import build_database
 from tasks.motion.mirror import mirrored
 from tasks.motion.posed import Posed
@@ -29,6 +29,7 @@ KERNEL = {
     "tune": False,
     "landmarks": 1000,
 }
+BONES = {name: value for name, value in KERNEL.items() if name not in ("represent", "tune")}
 NET = {
     "hidden": 32,
     "steps": 200,
@@ -91,7 +92,7 @@ def test_the_image_of_a_motion_is_what_the_image_of_its_poses_would_do(symmetric
     np.testing.assert_allclose(bones, moved(symmetric, expected), atol=1e-4)
 
 
-@pytest.mark.parametrize(("method", "settings"), [(part_kernel, KERNEL), (mlp, NET)])
+@pytest.mark.parametrize(("method", "settings"), [(part_kernel, KERNEL), (bone_kernel, BONES), (mlp, NET)])
 def test_what_the_left_arm_did_is_known_of_the_right(symmetric, method, settings):
     """The right arm rests in training and moves in the query: only the mirror image says what it does."""
     poses, right = symmetric.database.poses, [planted.NAMES.index(f"{n}_r") for n in ("arm", "elbow", "hand")]

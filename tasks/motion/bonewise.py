@@ -12,7 +12,7 @@ from tasks.motion.posed import Posed
 from tasks.motion.regression import LEAST, from_numbers, joint_weights, shape_units, to_numbers, with_past
 
 WIDTHS, DYNAMICS = (0.5, 1.0, 2.0), (1.0, 2.0)  # multiples of the settings that are tried
-SAMPLE = 600  # frames that the choice is made on
+SAMPLE = 800  # frames, images counted, that the choice is made on
 REPRESENT = ("residual", "root")
 
 
@@ -66,24 +66,33 @@ def choose(told: Told, more: Told | None, *, dynamics: float, width: float, ridg
     """
     if len(np.unique(told.clip)) < 2:
         return Choice(width, dynamics, 0.0, more is not None)
-    rows = np.unique(np.linspace(0, len(told.clip) - 1, min(SAMPLE, len(told.clip))).round().astype(int))
+    frames, most = len(told.clip), SAMPLE if more is None else SAMPLE // 2
+    rows = np.unique(np.linspace(0, frames - 1, min(most, frames)).round().astype(int))
     tried = [(width * w, dynamics * d) for w, d in product(WIDTHS, DYNAMICS)]
-    found = left_out(told, None, rows, tried, ridge)
     true = told.numbers[rows, :, :6]
-    errors = ((found[..., :6] - true) ** 2).sum((1, 2, 3))
-    best = int(np.argmin(errors))
-    made, (width, dynamics) = found[best], tried[best]
-    gains = False
-    if more is not None:
-        few = slice(None, None, 2)
-        alone, helped = (left_out(told, m, rows[few], [tried[best]], ridge)[0][..., :6] for m in (None, more))
-        gains = bool(((helped - true[few]) ** 2).sum() < ((alone - true[few]) ** 2).sum())
+    made, error, best = _best(told, more, rows, tried, ridge)
+    gains = more is not None
+    if gains:
+        alone = _best(told, None, rows, tried, ridge)
+        if alone[1] <= error:
+            (made, error, best), gains = alone, False
     whole = np.zeros((len(told.clip), *true.shape[1:]))
     whole[rows] = made[:, :, 6:]
     residual, root = made[:, :, :6], as_residual(told, whole)[rows]
     apart = residual - root
     share = float((apart * (residual - true)).sum() / max(float((apart**2).sum()), 1e-30))
+    width, dynamics = tried[best]
     return Choice(width, dynamics, float(np.clip(share, 0.0, 1.0)), gains)
+
+
+def _best(
+    told: Told, more: Told | None, rows: np.ndarray, tried: list[tuple[float, float]], ridge: float
+) -> tuple[np.ndarray, float, int]:
+    """What the best settings predict, (R, B, 12), its residuals' squared error, and which they are."""
+    found = left_out(told, more, rows, tried, ridge)
+    errors = ((found[..., :6] - told.numbers[rows, :, :6]) ** 2).sum((1, 2, 3))
+    best = int(np.argmin(errors))
+    return found[best], float(errors[best]), best
 
 
 def both(told: Told, residual: np.ndarray, root: np.ndarray, share: float) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""A process that compiles the kernels and one that loads them from numba's cache must give the same bits.
+"""What numba compiled and keeps: the same bits when compiled and when loaded, and never those of older sources.
 
 Numba keeps a compiled copy of a function for itself and one in each function that calls it; which of them a process
 runs depends on whether it compiled or loaded. Under fast maths the copies may add in another order.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -80,3 +81,24 @@ def test_fast_maths_only_where_no_other_kernel_calls() -> None:
     fast = {kernel for kernel in kernels.values() if kernel.targetoptions.get("fastmath")}
     assert fast, "no kernel uses fast maths any more: this test can go"
     assert not {k.py_func.__name__ for k in fast & called}
+
+
+def test_a_changed_kernel_changes_those_that_call_it(tmp_path: Path) -> None:
+    shutil.copytree(Path(tasks.__file__).parent, tmp_path / "tasks", ignore=shutil.ignore_patterns("__pycache__"))
+    work = """
+import numpy as np
+from tasks.bones.transforms import extrapolate
+still = np.zeros((1, 4, 3, 2))
+print(np.abs(extrapolate(still, still, 0.5)).max())
+"""
+    environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"} | {"PYTHONPATH": str(tmp_path)}
+    quiet = {"env": environment, "cwd": tmp_path, "capture_output": True, "text": True, "check": True}
+
+    def run() -> float:
+        return float(subprocess.run([sys.executable, "-c", work], **quiet).stdout)
+
+    assert run() < 1e-9
+    callee = tmp_path / "tasks" / "bones" / "rotation.py"
+    callee.write_text(callee.read_text(encoding="utf-8").replace("1.0 - s * (y * y", "3.0 - s * (y * y"), "utf-8")
+    assert abs(run() - 2.0) < 1e-9
+    assert len(list((tmp_path / "tasks" / "__pycache__").glob("kernels-*"))) == 1

@@ -313,6 +313,8 @@ def plan_pictures(planned: list[Planned], graph: Graph) -> list[Node]:
     for data in dict.fromkeys(p.case.data for p in planned):
         cases = [p for p in planned if p.case.data == data]
         cases = [p for p in cases if p.case.seed == min(q.case.seed for q in cases if q.case.method == p.case.method)]
+        truth = cases[0].nodes.get("test")  # that of other Gaussians has other points
+        cases = [p for p in cases if p.nodes.get("test") == truth]
         first = [p for p in cases if p.case.variant == cases[0].case.variant]
         shown = first if len(first) > 1 else cases
         shown = shown if len(shown) <= PANELS else [shown[0], *shown[1 - PANELS :]]

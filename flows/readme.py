@@ -30,6 +30,7 @@ GARMENTS = {
     "MLP+ (residual, dynamics, mirrored clips)": "mlp_plus",
     "GRU+": "gru_plus",
     "Part kernel (kernel regression by part, as PartMM+)": "part_kernel",
+    "Bone kernel (kernel regression by bone, settings by left-out clips)": "bone_kernel",
     "Bone response (linear filter by bone)": "bone_response",
 }
 MATCHED = {"FullMM": "fullmm", "PartMM": "partmm", "PartMM+": "partmm_plus", "Part kernel": "part_kernel"}

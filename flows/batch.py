@@ -7,8 +7,9 @@ from pathlib import Path
 
 from flows import config, schema
 from flows.config import Case, Missing
+from flows.exhibits import plan_files, plan_pictures, plan_videos
 from flows.graph import Graph, Node, union
-from flows.pipeline import Output, Planned, plan, plan_files, plan_pictures, plan_videos
+from flows.pipeline import Output, Planned, plan
 from tasks.errors import InputError
 
 OF_THE_WHOLE = ("sweep.experiments", "report.name", "report.title")  # overrides that single experiments do not get

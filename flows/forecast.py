@@ -13,10 +13,10 @@ from rich.table import Table
 
 from flows.batch import Batch, Work, work
 from flows.costs import Cost, Past, makespan
+from flows.engine import job_of
 from flows.graph import Graph, Node, short
 from flows.stage import key_of
 from flows.store import Ref, Store
-from flows.sweep import job_of
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from flows.server import server
 from flows.progress import Progress
 from flows.runners import task_runner
 from flows.stopping import stoppable
-from flows.sweep import compute
+from flows.engine import compute
 from tests.workflow.test_sweep import World
 
 world = World(Path(sys.argv[1]), sys.argv[2])

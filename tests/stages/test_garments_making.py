@@ -13,8 +13,9 @@ import pytest
 import trimesh
 
 from flows import config
+from flows.exhibits import plan_files, plan_pictures
 from flows.graph import Graph
-from flows.pipeline import plan, plan_files, plan_pictures
+from flows.pipeline import plan
 from tasks.datasets import garments
 from tasks.errors import InputError
 from tasks.garments import body, check, manifest, pack, pattern, retarget, simulate

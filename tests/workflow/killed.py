@@ -15,8 +15,8 @@ import tempfile
 import time
 from pathlib import Path
 
+from flows.engine import job_of
 from flows.graph import Graph
-from flows.sweep import job_of
 from tests.workflow.toy import TOY
 
 CHAINS, SIZE = 60, 100_000

@@ -9,10 +9,10 @@ from __future__ import annotations
 import sys
 
 from flows import config
+from flows.engine import job_of
 from flows.graph import Graph
 from flows.pipeline import plan
 from flows.stage import run
-from flows.sweep import job_of
 from tasks.reconstruction import fitting
 
 SCENE = ["scene.size=40", "scene.frames=8", "scene.views=24", "scene.test_views=2", "scene.samples=1"]

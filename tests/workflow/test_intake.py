@@ -5,8 +5,9 @@ from __future__ import annotations
 import pytest
 
 from flows import config
+from flows.exhibits import plan_files
 from flows.graph import Graph, Node
-from flows.pipeline import Planned, plan, plan_files
+from flows.pipeline import Planned, plan
 from tasks.errors import InputError
 
 TABLE4 = ["+experiment=table4", "sweep.datasets=[scene_figure]"]

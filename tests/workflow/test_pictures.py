@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from flows import config
+from flows.exhibits import plan_pictures
 from flows.graph import Graph
-from flows.pipeline import plan, plan_pictures
+from flows.pipeline import plan
 
 
 def test_errors_are_drawn_beside_one_truth_only():

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from flows import config, schema
+from flows import compose, config, schema
 from flows.config import Case, Missing
 from flows.exhibits import plan_files, plan_pictures, plan_videos
 from flows.graph import Graph, Node, union
@@ -74,7 +74,7 @@ def batch(overrides: list[str], multirun: bool = False) -> Batch:
         alone = Experiment(report["name"], report["title"], (*flags, *overrides), cases, missing)
         return Batch(cases[0].config, [alone], False)
     whole = schema.check_run(schema.check(whole, schema.schema(whole, config.SWEEP)))
-    kept = [text for text in overrides if config.parse(text).key_or_group not in (*OF_THE_WHOLE, "experiment")]
+    kept = [text for text in overrides if compose.parse(text).key_or_group not in (*OF_THE_WHOLE, "experiment")]
     used = set(overrides) - set(kept)
     experiments = []
     for name in names:

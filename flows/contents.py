@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 from omegaconf import OmegaConf
 
-from flows.config import CONF, NO_ABLATION, Case
+from flows.compose import CONF
+from flows.config import NO_ABLATION, Case
 from flows.schema import JOINTS
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ import traceback
 # torch's and numba's threads must not spin on shared cores; this has to be said before either is imported
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-from flows import config
+from flows import compose, config
 from flows.batch import batch
 from flows.runners import WorkerLost
 from tasks.errors import InputError
@@ -72,9 +72,9 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _epilog() -> str:
     lines = [EXAMPLES, "config groups (GROUP=CHOICE; +experiment=CHOICE and +ablation=CHOICE with a plus):"]
-    for group, choices in config.groups().items():
+    for group, choices in compose.groups().items():
         lines.append(f"  {group}")
-        lines += [f"    {choice:<22} {config.headline(group, choice)}" for choice in choices]
+        lines += [f"    {choice:<22} {compose.headline(group, choice)}" for choice in choices]
     lines.append("\nkeys and defaults: python -m flows.run --cfg")
     return "\n".join(lines)
 

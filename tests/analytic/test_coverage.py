@@ -87,7 +87,7 @@ def test_claims_say_whether_the_order_of_two_rows_is_the_papers():
 
 
 def test_what_stands_beside_the_paper_exists():
-    from flows.config import groups
+    from flows.compose import groups
     from flows.contents import paper_numbers
 
     known = paper_numbers()

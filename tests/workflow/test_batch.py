@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from flows.batch import batch, work
-from flows.config import groups, whole
+from flows.compose import groups
+from flows.config import whole
 from tasks.errors import InputError
 
 ONE = "sweep.methods=[partmm]"

@@ -5,15 +5,15 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import hydra
 import pytest
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from flows import config, ranges, run, schema, source
+from flows import compose, config, ranges, run, schema, source
 from flows.source import ROOT
 from tasks.errors import InputError
 
-GROUPS = config.groups()
+GROUPS = compose.groups()
 FILE = ["dataset=mesh_sequence", "dataset.path=some.npz"]
 OF_A_FIT = ("scene", "views")  # groups that only a fit has
 NEEDS_PATH = ("mesh_sequence", "rigged_character", "vto", "anime", "dnerf", "multiview")
@@ -24,7 +24,7 @@ def test_every_experiment_composes(name):
     cases = config.expand([f"+experiment={name}"])
     assert cases
     assert all(case.config["report"]["name"] == name for case in cases)
-    assert config.headline("experiment", name)
+    assert compose.headline("experiment", name)
 
 
 @pytest.mark.parametrize("group", [g for g in GROUPS if g not in ("experiment", "ablation")])
@@ -306,6 +306,6 @@ def test_help_and_mistakes_import_neither_torch_nor_prefect(arguments):
     ],
 )
 def test_configs_compose_as_hydra_composes_them(chosen):
-    with initialize_config_dir(str(config.CONF), version_base="1.3"):
-        plain = OmegaConf.to_container(compose("config", list(chosen)))
-    assert repr(OmegaConf.to_container(config._compose(chosen))) == repr(plain)
+    with hydra.initialize_config_dir(str(compose.CONF), version_base="1.3"):
+        plain = OmegaConf.to_container(hydra.compose("config", list(chosen)))
+    assert repr(OmegaConf.to_container(compose.compose(chosen))) == repr(plain)

@@ -9,8 +9,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from statistics import median
 
+from flows.cache import Artefact, Store
 from flows.graph import Graph, Node
-from flows.store import Artefact, Store
 
 # seconds of stages that take long, where no past tells; so rough that only their order counts
 ROUGH = {

@@ -7,6 +7,7 @@ from concurrent.futures import BrokenExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from flows.cache import CorruptArtefact, Ref, Store
 from flows.costs import Past, chains
 from flows.graph import Graph, Node, short
 from flows.progress import Progress
@@ -14,7 +15,6 @@ from flows.runners import WorkerLost, in_flight
 from flows.server import watched
 from flows.stage import Job, key_of, run
 from flows.stopping import stoppable
-from flows.store import CorruptArtefact, Ref, Store
 
 ATTEMPTS = 3  # how often damaged artefacts, or what a killed worker left, are computed again before giving up
 

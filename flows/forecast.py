@@ -12,11 +12,11 @@ from rich.console import Console
 from rich.table import Table
 
 from flows.batch import Batch, Work, work
+from flows.cache import Ref, Store
 from flows.costs import Cost, Past, makespan
 from flows.engine import job_of
 from flows.graph import Graph, Node, short
 from flows.stage import key_of
-from flows.store import Ref, Store
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from flows import source
-from flows.store import canonical_json
+from flows.cache import canonical_json
 from tasks.errors import InputError
 
 

@@ -15,8 +15,8 @@ from rich.spinner import Spinner
 from rich.table import Table
 from rich.text import Text
 
+from flows.cache import Ref
 from flows.graph import Graph, Node, short
-from flows.store import Ref
 
 
 class Progress:

@@ -7,10 +7,10 @@ import re
 import subprocess
 from importlib.metadata import PackageNotFoundError, requires, version
 
+from flows.cache import Ref
 from flows.config import Case
 from flows.graph import Graph
 from flows.source import ROOT
-from flows.store import Ref
 
 PACKAGE = "skelebones"
 

@@ -7,11 +7,11 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from flows.cache import Ref, Store
 from flows.config import Case
 from flows.contents import charts_of, tables_of, variant_of
 from flows.pipeline import Planned
 from flows.provenance import provenance
-from flows.store import Ref, Store
 
 if TYPE_CHECKING:
     import pandas as pd

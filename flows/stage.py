@@ -19,8 +19,8 @@ from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
 
+from flows.cache import Ref, Store, canonical_json, explained
 from flows.source import FILES, WORKSPACE
-from flows.store import Ref, Store, canonical_json, explained
 from tasks.values import Training
 from tasks.workspace import Workspace
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from flows.artifacts import Board
 from flows.batch import Batch, Work, work
+from flows.cache import CorruptArtefact, Store
 from flows.config import Missing
 from flows.engine import ATTEMPTS, Outcome, compute
 from flows.graph import Graph, Node, short
@@ -17,7 +18,6 @@ from flows.progress import Progress
 from flows.runners import WorkerLost, task_runner
 from flows.server import lost, server
 from flows.stopping import stoppable
-from flows.store import CorruptArtefact, Store
 from tasks.errors import InputError
 
 if TYPE_CHECKING:

@@ -19,9 +19,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from flows.cache import CorruptArtefact, Store
 from flows.source import ROOT
 from flows.stage import run
-from flows.store import CorruptArtefact, Store
 from tasks.errors import InputError
 from tasks.values import Animation, same
 from tests.workflow.killed import CHAINS, KILLS

@@ -1,155 +1,125 @@
-"""The store: what goes in comes out, and damage is noticed."""
+"""The store's commands: what they list, what they free and what they spare, and that damage is told by the status."""
 
 from __future__ import annotations
 
-import errno
 import json
-import multiprocessing
-import os
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 
-import numpy as np
 import pytest
 
-from flows.store import CorruptArtefact, Store, canonical_json, decode, encode, explained
-from tasks.errors import InputError
-from tasks.values import Animation, Metrics, Motion, Rig, Skinning, same
+from flows.cache import Store
+from flows.stage import run
+from flows.store import main
+from tests.workflow.test_sweep import job
 
 
-def motion() -> Motion:
-    rng = np.random.default_rng(0)
-    rig = Rig(
-        ("root", "tip"),
-        np.array([-1, 0], np.int32),
-        rng.normal(size=(2, 3)).astype(np.float32),
-        np.full((5, 2), 0.5, np.float32),
-        np.tile(np.eye(3, dtype=np.float32), (4, 2, 1, 1)),
-        np.zeros((4, 2, 3), np.float32),
-    )
-    points = rng.normal(size=(4, 5, 3)).astype(np.float32)
-    faces = np.array([[0, 1, 2], [2, 3, 4]], np.int32)
-    return Motion("x", points, faces, np.array([0, 1, 4]), ("a", "bé"), 24.0, "m", points[0], rig)
+@pytest.fixture
+def kept(tmp_path):
+    """A store with two artefacts, one of which a report needs. -> (folder, needed, idle)."""
+    needed, idle = run(job(tmp_path)), run(job(tmp_path, settings={"value": 2.0, "log": str(tmp_path / "log.txt")}))
+    report = tmp_path / "reports" / "one"
+    report.mkdir(parents=True)
+    stages = [{"stage": needed.stage, "key": needed.key}]
+    (report / "provenance.json").write_text(json.dumps({"stages": stages}))
+    return tmp_path, needed, idle
 
 
-VALUES = [
-    motion(),
-    Metrics(("a",), ("mm",), np.array([1.5])),
-    Metrics((), (), np.zeros(0)),
-    Animation(np.zeros((2, 3, 3), np.float32)),
-]
+def command(folder, *arguments: str) -> int:
+    name, *rest = arguments
+    reports = ["--reports", str(folder / "reports")] if name == "gc" else []
+    return main([name, "--store", str(folder / "store"), *reports, *rest])
 
 
-@pytest.mark.parametrize("value", VALUES, ids=lambda v: type(v).__name__)
-def test_values_survive_to_the_bit(value):
-    assert same(decode(encode(value)), value)
-    assert encode(value) == encode(decode(encode(value)))
+def there(folder) -> set[str]:
+    return {a.key for a in Store(folder / "store").artefacts()}
 
 
-def test_values_that_cannot_be_stored_are_refused():
-    with pytest.raises(TypeError, match="cannot be stored"):
-        encode(Metrics(("a",), ("mm",), {"not": "an array"}))
+def test_ls(kept, capsys):
+    folder, needed, _ = kept
+    assert command(folder, "ls") == 0
+    assert "2 artefacts" in capsys.readouterr().out
+    assert command(folder, "ls", "make") == 0
+    assert needed.key[:12] in capsys.readouterr().out
+    assert command(folder, "ls", "nope") == 2
+    assert capsys.readouterr().err.strip() == "error: stage: expected one of make, found 'nope'"
 
 
-def put(store: Store, key: str = "k") -> object:
-    with store.lock("stage", key):
-        return store.put("stage", key, {"out": VALUES[1]}, {"seconds": 1.0, "peak_mb": 2.0})
+def test_gc_spares_what_reports_need_and_what_is_young_and_asks_first(kept, capsys):
+    folder, needed, idle = kept
+    draft = folder / "store" / "make" / "abc.tmp"
+    draft.mkdir()
+    (draft / "out.safetensors").write_bytes(bytes(1000))
+    assert command(folder, "gc", "--yes") == 0
+    assert there(folder) == {needed.key, idle.key}  # both are younger than an hour
+    assert "1 are younger than 1 h" in capsys.readouterr().out
+    assert command(folder, "gc", "--older", "0") == 0
+    assert there(folder) == {needed.key, idle.key}
+    assert "add --yes" in capsys.readouterr().out
+    assert command(folder, "gc", "--older", "0", "--yes") == 0
+    assert there(folder) == {needed.key}
+    assert not draft.exists()
+    assert Store(folder / "store").find("make", needed.key)
+    assert not list((folder / "store").rglob("*.lock"))
+    assert command(folder, "verify") == 0
 
 
-def test_found_only_when_whole(tmp_path):
-    store = Store(tmp_path / "store")
-    assert store.find("stage", "k") is None
-    ref = put(store)
-    found = store.find("stage", "k")
-    assert found.outputs == ref.outputs
-    assert found.cached
-    assert same(store.load(found, "out"), VALUES[1])
+def test_gc_without_reports_frees_nothing(kept, capsys):
+    folder, needed, idle = kept
+    (folder / "reports" / "one" / "provenance.json").write_text("{")
+    assert command(folder, "gc", "--older", "0", "--yes") == 2
+    assert main(["gc", "--store", str(folder / "store"), "--reports", str(folder / "none"), "--yes"]) == 2
+    assert there(folder) == {needed.key, idle.key}
 
 
-def test_truncated_artefact_is_not_a_hit(tmp_path):
-    store = Store(tmp_path)
-    put(store)
-    file = tmp_path / "stage" / "k" / "out.safetensors"
-    file.write_bytes(file.read_bytes()[:-1])
-    assert store.find("stage", "k") is None
-    put(store)
-    assert same(store.load(store.find("stage", "k"), "out"), VALUES[1])
-
-
-def test_flipped_bit_is_noticed_on_load(tmp_path):
-    store = Store(tmp_path)
-    ref = put(store)
-    file = tmp_path / "stage" / "k" / "out.safetensors"
+def test_verify_finds_a_flipped_bit_a_missing_file_and_a_broken_description(kept, capsys):
+    folder, needed, idle = kept
+    assert command(folder, "verify") == 0
+    assert "2 artefacts read, 0 damaged" in capsys.readouterr().out
+    file = folder / "store" / "make" / needed.key / "out.safetensors"
     data = bytearray(file.read_bytes())
     data[-1] ^= 1
     file.write_bytes(bytes(data))
-    assert store.find("stage", "k") is not None  # the size is right
-    with pytest.raises(CorruptArtefact):
-        store.load(ref, "out")
+    assert command(folder, "verify") == 2
+    said = capsys.readouterr().out
+    assert f"damaged: make/{needed.key}" in said
+    assert idle.key not in said
+    file.unlink()
+    (folder / "store" / "make" / idle.key / "meta.json").write_text("{")
+    assert command(folder, "verify") == 2
+    assert "2 artefacts read, 2 damaged" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", "{}", '{"outputs": {"out": {}}}', '{"outputs": 3}'])
-def test_broken_meta_is_not_a_hit(tmp_path, text):
-    store = Store(tmp_path)
-    put(store)
-    (tmp_path / "stage" / "k" / "meta.json").write_text(text)
-    assert store.find("stage", "k") is None
+def test_without_a_store(tmp_path, capsys):
+    assert main(["ls", "--store", str(tmp_path / "none")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not (tmp_path / "none").exists()
 
 
-def test_leftovers_of_a_crash_are_replaced(tmp_path):
-    store = Store(tmp_path)
-    draft = tmp_path / "stage" / "k.tmp"
-    draft.mkdir(parents=True)
-    (draft / "half").write_bytes(b"x")
-    put(store)
-    assert not draft.exists()
-    assert store.find("stage", "k")
+def test_gc_beside_runs_breaks_no_lock(tmp_path):
+    """Four writers count in a file that only the lock guards, while lock files are removed all the time."""
+    store, counter, ended = Store(tmp_path / "store"), tmp_path / "count", threading.Event()
+    counter.write_text("0")
 
+    def count() -> None:
+        for _ in range(6):
+            with Store(store.path).lock("stage", "k"):
+                seen = int(counter.read_text())
+                time.sleep(0.0005)
+                counter.write_text(str(seen + 1))
 
-@pytest.mark.parametrize(
-    ("number", "words"),
-    [(errno.ENOSPC, "full disk"), (errno.EROFS, "read-only"), (errno.EACCES, "no permission")],
-)
-def test_unusable_disk_is_one_line(tmp_path, number, words):
-    with pytest.raises(InputError, match=words), explained(tmp_path):
-        raise OSError(number, os.strerror(number))
+    def sweep() -> None:
+        while not ended.is_set():
+            store.sweep_locks()
+            time.sleep(0.002)
 
-
-def test_a_file_in_the_stores_place(tmp_path):
-    (tmp_path / "store").write_text("")
-    with pytest.raises(InputError, match="a file in its place"):
-        Store(tmp_path / "store")
-
-
-def _race(path: str, queue) -> None:
-    store = Store(path)
-    with store.lock("stage", "k"):
-        found = store.find("stage", "k")
-        if not found:
-            put_locked = store.put("stage", "k", {"out": VALUES[1]}, {"seconds": 0.0, "peak_mb": 0.0})
-            queue.put("wrote" if put_locked else "")
-        else:
-            queue.put("found")
-
-
-def test_of_several_writers_one_writes(tmp_path):
-    context = multiprocessing.get_context("spawn")
-    queue = context.Queue()
-    workers = [context.Process(target=_race, args=(str(tmp_path), queue)) for _ in range(3)]
-    for worker in workers:
-        worker.start()
-    said = sorted(queue.get(timeout=60) for _ in workers)
-    for worker in workers:
-        worker.join(60)
-    assert said == ["found", "found", "wrote"]
-
-
-def test_canonical_json_does_not_depend_on_order():
-    assert canonical_json({"b": 1, "a": [1.5]}) == canonical_json(json.loads('{"a": [1.5], "b": 1}'))
-    with pytest.raises(ValueError):
-        canonical_json(float("nan"))
-
-
-def test_skinning_round_trip_keeps_types():
-    value = Skinning(*(np.ones(s, np.float32) for s in ((2, 3), (2, 1), (1, 1, 3, 4))), np.ones(2))
-    back = decode(encode(value))
-    assert back.history.dtype == np.float64
-    assert back.rest.dtype == np.float32
+    with ThreadPoolExecutor(5) as pool:
+        sweeping, writers = pool.submit(sweep), [pool.submit(count) for _ in range(4)]
+        failures = [writer.exception(timeout=60) for writer in writers]
+        ended.set()
+        sweeping.result(timeout=60)
+    assert failures == [None] * 4
+    assert counter.read_text() == "24"
+    store.sweep_locks()
+    assert not list(store.path.rglob("*.lock"))

@@ -11,12 +11,12 @@ from types import SimpleNamespace
 import pytest
 
 from flows import source, stage
+from flows.cache import CorruptArtefact, Store
 from flows.engine import compute
 from flows.graph import Graph, digest_of_files, short
 from flows.progress import Progress
 from flows.runners import WorkerLost, task_runner
 from flows.stage import Job, key_of, run
-from flows.store import CorruptArtefact, Store
 from flows.sweep import StageFailed, check_place, raise_first
 from tasks.errors import InputError
 from tasks.values import Training

@@ -269,13 +269,15 @@ def _finite(where: str, points: np.ndarray) -> None:
 
 def _resolved(where: str, points: np.ndarray) -> None:
     """Far from the origin, neighbouring float32 numbers lie farther apart than the shape's details."""
-    farthest = float(np.abs(points[0]).max())
-    if np.spacing(np.float32(farthest)) > COARSE * max(diagonal(points[0]), diagonal(points[-1])) > 0:
+    reach = [float(np.abs(frame).max()) for frame in points]
+    frame = int(np.argmax(reach))
+    if np.spacing(np.float32(reach[frame])) > COARSE * max(diagonal(points[0]), diagonal(points[-1])) > 0:
         raise InputError(
             where,
             expected="a shape near the origin",
-            found=f"coordinates up to {farthest:.3g} of a shape {diagonal(points[0]):.3g} across, too far for float32",
-            do="subtract the centre of the first frame from all frames",
+            found=f"coordinates up to {reach[frame]:.3g} at frame {frame} of a shape {diagonal(points[0]):.3g} across, "
+            "too far for float32",
+            do="subtract the centre of the first frame from all frames, and a path that leads so far",
         )
 
 

@@ -77,6 +77,10 @@ BAD_ARRAYS = {
     "complex": ({"vertices": moving_cube() * 1j}, ("real numbers", "complex")),
     "pickled": ({"vertices": np.array([CUBE, None], dtype=object)}, ("vertices", "pickled", "never loaded")),
     "far from the origin": ({"vertices": moving_cube() + 1e6}, ("origin", "1e+06", "subtract the centre")),
+    "walks far from the origin": (
+        {"vertices": moving_cube() + np.arange(5.0)[:, None, None] * 1e6},
+        ("origin", "4e+06 at frame 4", "a path that leads so far"),
+    ),
     "too small": ({"vertices": moving_cube() * np.float32(1e-7)}, ("1e-05 to 1e+09 units", "scale all coordinates")),
     "too large": ({"vertices": moving_cube() * np.float32(1e12)}, ("1e-05 to 1e+09 units", "scale all coordinates")),
     "still": ({"vertices": np.repeat(CUBE[None], 5, 0)}, ("moving", "5 frames")),

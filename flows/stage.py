@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import importlib
 import json
+import os
 import shutil
 import threading
 import time
@@ -25,6 +26,7 @@ from tasks.values import Training
 from tasks.workspace import Workspace
 
 FORMAT = 1  # raise it when the store's layout changes
+SPENT = "seconds"  # file in a stage's folder: what it has taken so far, read by who goes on after a kill
 
 
 @dataclass(frozen=True)
@@ -78,6 +80,7 @@ def _versions() -> dict[str, str]:
 
 def run(job: Job, say: Callable[[str, float], None] = _silent) -> Ref:
     """The job's artefact, from the store or computed now. Any process may call it; equal jobs wait for one another.
+    Its seconds are those of all parts of a stage that was killed and went on.
 
     say: hears how far a long stage is, a text and a share of the whole.
     """
@@ -90,8 +93,9 @@ def run(job: Job, say: Callable[[str, float], None] = _silent) -> Ref:
         if found:
             return found
         tell(job, "computing")
-        with Watch() as watch:
-            values = _compute(job, store, key, say)
+        folder = store.scratch(job.stage, key)
+        with Watch(_spent(folder)) as watch:
+            values = _compute(job, folder, partial(_progress, job, say, folder, watch))
         meta = {
             "function": job.function,
             "settings": job.settings,
@@ -100,7 +104,7 @@ def run(job: Job, say: Callable[[str, float], None] = _silent) -> Ref:
             "peak_mb": round(watch.peak_mb, 1),
         }
         ref = store.put(job.stage, key, values, meta)
-        shutil.rmtree(store.scratch(job.stage, key), ignore_errors=True)
+        shutil.rmtree(folder, ignore_errors=True)
         return ref
 
 
@@ -113,7 +117,13 @@ def tell(job: Job, event: str, **more: object) -> None:
 
 
 class Watch:
-    """Seconds and the process's peak memory while a stage runs (other threads' share is in it)."""
+    """Seconds and the process's peak memory while a stage runs (other threads' share is in it).
+
+    earlier: seconds that it took before, in processes that were killed.
+    """
+
+    def __init__(self, earlier: float = 0.0) -> None:
+        self._earlier = earlier
 
     def __enter__(self) -> Watch:
         import psutil
@@ -127,9 +137,13 @@ class Watch:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.seconds = time.perf_counter() - self._start
+        self.seconds = self.so_far()
         self._stop.set()
         self._thread.join()
+
+    def so_far(self) -> float:
+        """Seconds, with the earlier ones."""
+        return self._earlier + time.perf_counter() - self._start
 
     def _resident(self) -> float:
         return self._process.memory_info().rss / 2**20
@@ -152,24 +166,38 @@ def one_blas_thread() -> None:
     threadpool_limits(1, user_api="blas")
 
 
-def _compute(job: Job, store: Store, key: str, say: Callable[[str, float], None]) -> dict[str, object]:
+def _compute(job: Job, folder: Path, say: Callable[[str, float], None]) -> dict[str, object]:
     one_blas_thread()
     module, name = job.function.split(":")
     function = getattr(importlib.import_module(module), name)
+    store = Store(job.store)
     inputs = {n: _load(store, value) for n, value in job.inputs.items()}
     if WORKSPACE in function.__annotations__:
-        folder = store.scratch(job.stage, key)
         with explained(folder):
             folder.mkdir(parents=True, exist_ok=True)
-        inputs[WORKSPACE] = Workspace(folder, partial(_progress, job, say), job.max_gb)
+        inputs[WORKSPACE] = Workspace(folder, say, job.max_gb)
     result = function(**inputs, **job.settings)
     values = result if isinstance(result, tuple) else (result,)
     return dict(zip(job.outputs, values, strict=True))
 
 
-def _progress(job: Job, say: Callable[[str, float], None], text: str, fraction: float) -> None:
+def _progress(
+    job: Job, say: Callable[[str, float], None], folder: Path, watch: Watch, text: str, fraction: float
+) -> None:
     tell(job, "progress", text=text, fraction=fraction)
     say(text, fraction)
+    draft = folder / f"{SPENT}.partial"
+    with explained(folder):
+        draft.write_text(repr(watch.so_far()), "utf-8")
+        os.replace(draft, folder / SPENT)
+
+
+def _spent(folder: Path) -> float:
+    """Seconds that a stage took up to the last word of those parts of it that were killed."""
+    try:
+        return float((folder / SPENT).read_text("utf-8"))
+    except (FileNotFoundError, ValueError):  # a machine that lost its power may leave an empty file
+        return 0.0
 
 
 def _load(store: Store, value: object) -> object:

@@ -21,7 +21,7 @@ import pytest
 
 from flows.cache import CorruptArtefact, Store
 from flows.source import ROOT
-from flows.stage import run
+from flows.stage import SPENT, run
 from tasks.errors import InputError
 from tasks.values import Animation, same
 from tests.workflow.killed import CHAINS, KILLS
@@ -72,7 +72,7 @@ def test_a_killed_fit_goes_on_and_ends_with_the_same_bits(tmp_path):
 
     assert start("calm").wait(300) == 0
     shutil.copytree(tmp_path / "calm", tmp_path / "killed", ignore=shutil.ignore_patterns("gaussians"))
-    moment, last = random.Random(0), []
+    moment, last, spent = random.Random(0), [], []
     for _ in range(2):
         worker = start("killed")
         while kept() == last:  # until it has gone on from where the one before was killed
@@ -82,8 +82,13 @@ def test_a_killed_fit_goes_on_and_ends_with_the_same_bits(tmp_path):
         worker.kill()
         assert worker.wait() == -signal.SIGKILL
         last = kept()
+        (file,) = (tmp_path / "killed").rglob(SPENT)
+        spent.append(float(file.read_text("utf-8")))
     assert start("killed").wait(300) == 0
     assert contents(tmp_path / "killed") == contents(tmp_path / "calm")
+    (meta,) = (tmp_path / "killed" / "gaussians").rglob("meta.json")
+    spent.append(json.loads(meta.read_text("utf-8"))["seconds"])
+    assert 0.0 < spent[0] < spent[1] < spent[2]  # every part goes on counting where the one before was killed
 
 
 @pytest.mark.parametrize("shift", [-1e9, 1e9], ids=["back", "forward"])

@@ -12,7 +12,7 @@ from flows.config import NO_ABLATION, Case
 from flows.schema import JOINTS
 
 if TYPE_CHECKING:
-    from tasks.evaluation.paper import Paper
+    from tasks.reporting.paper import Paper
 
 UNSEEN = ("rmse_pct", "rmse", "rmse_coordinate")
 MOTION = ("velocity_rmse", "speed_ratio", "max_error")
@@ -89,7 +89,7 @@ TRUTH = ("joint_f1", "joint_f1_fine", "link_f1", "j2j_pct", "j2b_pct", "b2b_pct"
 def tables_of(cases: list[Case], rows, remarks: list[str], said: list[str]) -> list:
     """The tables of an experiment, from its cases' configs and the rows of its metrics.csv. remarks: on the data; said:
     of the run."""
-    from tasks.evaluation.tables import build, unranked
+    from tasks.reporting.tables import build, unranked
 
     paper, settings = paper_numbers(), cases[0].config["report"]
     data_status, stands_for = places(cases, rows)
@@ -119,8 +119,8 @@ def charts_of(cases: list[Case], rows) -> list:
 
 def _result_tables(cases: list[Case], rows, settings: dict, notes: list[str], paper, common: dict) -> list:
     """What the methods made: images, vertices, motion, confidence, paths. The first table has notes and the paper."""
-    from tasks.evaluation.rows import with_means
-    from tasks.evaluation.tables import build
+    from tasks.reporting.rows import with_means
+    from tasks.reporting.tables import build
 
     has = {str(m) for m in rows["metric"].unique()}
     plain = common | {"baselines": []}
@@ -150,7 +150,7 @@ def _result_tables(cases: list[Case], rows, settings: dict, notes: list[str], pa
 def _distance_tables(cases: list[Case], rows, common: dict) -> list:
     """How far the unseen poses lie from the database, by clip and part; it is the same for all methods. Only of data
     whose skeleton is given: joints found by us have no names that say something."""
-    from tasks.evaluation.tables import build, unranked
+    from tasks.reporting.tables import build, unranked
 
     given = {c.dataset for c in cases if c.config["skeleton"]["kind"] == "given"}
     found = rows[rows["metric"].str.startswith(f"{DISTANCE}@") & rows["dataset"].isin(given)]
@@ -163,8 +163,8 @@ def _distance_tables(cases: list[Case], rows, common: dict) -> list:
 
 def _rig_tables(cases: list[Case], rows, remarks: list[str], common: dict) -> list:
     """Bones and skeleton: they do not depend on the method, seldom on the variant; a row for each that differs."""
-    from tasks.evaluation.rows import with_means
-    from tasks.evaluation.tables import build
+    from tasks.reporting.rows import with_means
+    from tasks.reporting.tables import build
 
     lead = rows[rows["method"] == cases[-1].method].drop_duplicates(["dataset", "subject", "metric", "key", "seed"])
     other = lead["variant"].str.endswith(OTHER_WAYS)
@@ -181,7 +181,7 @@ def _rig_tables(cases: list[Case], rows, remarks: list[str], common: dict) -> li
 
 def _garment_tables(rows, settings: dict, remarks: list[str], common: dict) -> list:
     """The cloth's quality as a whole, then clip by clip."""
-    from tasks.evaluation.tables import build, unranked
+    from tasks.reporting.tables import build, unranked
 
     common |= {"data_status": {}, "stands_for": {}, "baselines": []}
     notes = [*remarks, *([settings["note"]] if settings["note"] else [])]
@@ -191,8 +191,8 @@ def _garment_tables(rows, settings: dict, remarks: list[str], common: dict) -> l
 
 def _gain_tables(rows, settings: dict, paper, common: dict) -> list:
     """How far each of the methods asked for lies below every other one, beside what the paper prints."""
-    from tasks.evaluation.gains import GAIN, gains, printed_gains
-    from tasks.evaluation.tables import build, unranked
+    from tasks.reporting.gains import GAIN, gains, printed_gains
+    from tasks.reporting.tables import build, unranked
 
     number, tables = settings["paper_table"], []
     for method in settings["gains_of"]:
@@ -209,7 +209,7 @@ def _gain_tables(rows, settings: dict, paper, common: dict) -> list:
 
 def _benchmark_tables(cases: list[Case], rows, settings: dict, common: dict) -> list:
     """What decides first, then the numbers behind it; rows are subjects and columns peers, for few are compared."""
-    from tasks.evaluation.tables import build, unranked
+    from tasks.reporting.tables import build, unranked
 
     config = cases[0].config
     first, others = BENCHMARKS[config["pipeline"]]
@@ -258,7 +258,7 @@ def _notes(cases: list[Case], settings: dict) -> list[str]:
 
 def _curve(cases: list[Case], rows, curve: list[str] | None) -> list:
     """A metric against a key of the config: a line for every dataset, or of several methods one chart a dataset."""
-    from tasks.evaluation.charts import curve_chart, methods_chart
+    from tasks.drawing.charts import curve_chart, methods_chart
     from tasks.values import Picture
 
     if not curve:
@@ -287,7 +287,7 @@ def _at(config: dict, key: str) -> float:
 
 def _charts(rows, labels: dict[str, str]) -> list:
     """Errors by clip where methods are compared, changes by variant where one method is varied."""
-    from tasks.evaluation.charts import ablation_chart, clips_chart
+    from tasks.drawing.charts import ablation_chart, clips_chart
     from tasks.values import Picture
 
     drawn = []
@@ -309,7 +309,7 @@ def _charts(rows, labels: dict[str, str]) -> list:
 
 def paper_numbers() -> Paper:
     """What the paper prints."""
-    from tasks.evaluation.paper import paper_of
+    from tasks.reporting.paper import paper_of
 
     return paper_of(OmegaConf.to_container(OmegaConf.load(CONF / "paper" / "gaussianimate.yaml")))
 

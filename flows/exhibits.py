@@ -92,7 +92,7 @@ def _views_pictures(planned: list[Planned], graph: Graph) -> list[Node]:
     found = []
     for cases in seen.values():
         rendered = {label: p.nodes["rendered"] for label, p in zip(_labels(cases), cases, strict=True)}
-        function, truth = "tasks.evaluation.pictures:views_picture", cases[0].nodes["seen"]
+        function, truth = "tasks.drawing.pictures:views_picture", cases[0].nodes["seen"]
         inputs = {"truth": truth, "rendered": dict(list(rendered.items())[:PANELS])}
         found.append(graph.add("figures", function, {}, outputs=("picture",), case=cases[0].case.data, **inputs))
     return found
@@ -111,7 +111,7 @@ def plan_videos(planned: list[Planned], graph: Graph) -> list[Node]:
             continue
         animations = {label: p.nodes["animation"] for label, p in zip(_labels(shown), shown, strict=True)}
         inputs = {n: shown[0].nodes[n] for n in ("test", "canonical")} | {"animations": animations}
-        function, settings = "tasks.evaluation.pictures:clip_picture", {"focus": list(animations)[-1]}
+        function, settings = "tasks.drawing.pictures:clip_picture", {"focus": list(animations)[-1]}
         found.append(graph.add("video", function, settings, outputs=("picture",), case=data, **inputs))
     return found
 
@@ -126,7 +126,7 @@ def _pictures(shown: list[Planned], graph: Graph) -> list[Node]:
     lead = shown[-1]
 
     def add(function: str, names: str, settings: dict | None = None, **inputs: object) -> Node:
-        path = f"tasks.evaluation.pictures:{function}"
+        path = f"tasks.drawing.pictures:{function}"
         inputs |= {n: lead.nodes[n] for n in names.split()}
         about = {"outputs": ("picture",), "case": lead.case.data, "title": function.replace("_", " ")}
         return graph.add("figures", path, settings or {}, **about, **inputs)
@@ -150,6 +150,6 @@ def _pictures(shown: list[Planned], graph: Graph) -> list[Node]:
 
 
 def _confidence_picture(lead: Planned, animations: dict[str, Output], graph: Graph) -> Node:
-    function = "tasks.evaluation.confidence:confidence_picture"
+    function = "tasks.drawing.confidence:confidence_picture"
     inputs = {n: lead.nodes[n] for n in ("confidence", "test")} | {"animations": animations}
     return graph.add("figures", function, {}, outputs=("picture",), case=lead.case.data, **inputs)

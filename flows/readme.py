@@ -70,7 +70,7 @@ def filled(text: str, reports: Path) -> str:
 
 
 def _numbers(folder: Path) -> pd.DataFrame:
-    from tasks.evaluation.rows import from_csv
+    from tasks.reporting.rows import from_csv
 
     try:
         rows = from_csv((folder / "metrics.csv").read_text("utf-8"), str(folder / "metrics.csv"))

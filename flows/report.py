@@ -141,7 +141,7 @@ def show(found: Comparison, tolerance: float, console: Console) -> None:
 def _tolerance(known: argparse.Namespace) -> float:
     if known.tolerance is not None:
         return known.tolerance
-    from tasks.evaluation.report import read_provenance
+    from tasks.reporting.report import read_provenance
 
     one, two = (read_provenance(folder) for folder in known.reports)
     return 0.0 if one.get("machine") == two.get("machine") else TOLERANCE
@@ -149,8 +149,8 @@ def _tolerance(known: argparse.Namespace) -> float:
 
 def _read(folder: Path) -> tuple[dict[tuple[str, ...], tuple[float, str]], dict]:
     """The numbers of a report by their place, and its provenance."""
-    from tasks.evaluation.report import read_provenance
-    from tasks.evaluation.rows import from_csv
+    from tasks.reporting.report import read_provenance
+    from tasks.reporting.rows import from_csv
 
     file = folder / "metrics.csv"
     try:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from flows.batch import Experiment, Work
-    from tasks.evaluation.tables import Table
+    from tasks.reporting.tables import Table
     from tasks.values import Picture
 
 
@@ -36,14 +36,14 @@ class Report:
     @property
     def markdown(self) -> str:
         """The tables for Prefect's page."""
-        from tasks.evaluation import typeset
+        from tasks.reporting import typeset
 
         return "\n".join(typeset.markdown(t) for t in self.tables)
 
     @property
     def shown(self) -> list:
         """The tables for the terminal, without details."""
-        from tasks.evaluation import typeset
+        from tasks.reporting import typeset
 
         return [typeset.terminal(t) for t in self.tables if not t.folded]
 
@@ -57,8 +57,8 @@ class Report:
 
 def write(work: Work, refs: dict[str, Ref], computed: set[str], store: Store) -> Report:
     """Writes a report's folder."""
-    from tasks.evaluation import report
-    from tasks.evaluation.rows import join
+    from tasks.reporting import report
+    from tasks.reporting.rows import join
 
     planned, cases = work.planned, [p.case for p in work.planned]
     settings = cases[0].config["report"]
@@ -81,7 +81,7 @@ def write(work: Work, refs: dict[str, Ref], computed: set[str], store: Store) ->
 
 
 def _rows(case: Planned, refs: dict[str, Ref], store: Store):
-    from tasks.evaluation.rows import join, rows_of
+    from tasks.reporting.rows import join, rows_of
 
     config = case.case.config
     labels = {

@@ -41,7 +41,7 @@ SCENE_MOTION = "tasks.captures.scenes:scene_motion"
 SCENE = "tasks.captures.scenes:render_scene"
 SCENE_FILES = "tasks.captures.scenes:scene_files"
 EVALUATE_SCENE = "tasks.evaluation.scenes:evaluate_scene"
-SCENE_PICTURE = "tasks.evaluation.pictures:scene_picture"
+SCENE_PICTURE = "tasks.drawing.pictures:scene_picture"
 FIT = "tasks.reconstruction.fit:fit"
 TRAJECTORIES = "tasks.reconstruction.motion:motion_of"
 ANCHORED = "tasks.reconstruction.anchors:anchored"
@@ -78,7 +78,7 @@ GARMENTS = {
     "pack": "tasks.garments.pack:pack_garment",
     "check": "tasks.garments.manifest:check_garment",
     "manifest": "tasks.garments.manifest:manifest",
-    "picture": "tasks.evaluation.pictures:garment_picture",
+    "picture": "tasks.drawing.pictures:garment_picture",
 }
 EXPORTS = {
     "glb": "tasks.export.character:bones_glb",

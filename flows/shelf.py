@@ -19,8 +19,8 @@ COLLECTION = "paper"  # the experiment whose order and title the page of a folde
 def read(folder: Path) -> Report:
     """A report as it was written, its tables made anew from metrics.csv. Raises InputError where one of its files
     cannot be read."""
-    from tasks.evaluation import report
-    from tasks.evaluation.rows import from_csv
+    from tasks.reporting import report
+    from tasks.reporting.rows import from_csv
 
     origin = report.read_provenance(folder)
     if "missing" not in origin:
@@ -41,7 +41,7 @@ def read(folder: Path) -> Report:
 
 def made_again(folder: Path) -> dict[str, bytes]:
     """The files of a report but its provenance, made anew from its metrics.csv, provenance.json and figures."""
-    from tasks.evaluation import report
+    from tasks.reporting import report
 
     found = read(folder)
     return report.contents(folder.name, found.rows, found.tables, dict(found.figures), found.provenance)
@@ -49,7 +49,7 @@ def made_again(folder: Path) -> dict[str, bytes]:
 
 def render_again(folder: Path) -> int:
     """Writes the files of :func:`made_again` over a report's own; returns how many changed."""
-    from tasks.evaluation import report
+    from tasks.reporting import report
 
     return report.replace_files(folder, made_again(folder))
 
@@ -86,7 +86,7 @@ def _absent(name: str, folder: Path) -> Report:
 
 
 def _write_index(folder: Path, title: str, reports: list[Report]) -> Path:
-    from tasks.evaluation import coverage, index, report
+    from tasks.reporting import coverage, index, report
 
     made = [r for r in reports if r.folder]
     measured = [

@@ -15,8 +15,8 @@ import numpy as np
 from tasks.benchmarks.cost import Cost, measure, median, threads_held
 from tasks.bones.clustering import cluster
 from tasks.bones.ssdr import ssdr
+from tasks.drawing import plot
 from tasks.errors import InputError
-from tasks.evaluation import plot
 from tasks.evaluation.metrics import declared
 from tasks.values import Canonical, Metrics, Motion, Picture
 

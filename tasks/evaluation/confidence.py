@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.stats import rankdata
 
-from tasks.evaluation import plot
 from tasks.evaluation.metrics import clip_keys, declared, frame_rmse
-from tasks.values import Animation, Confidence, Files, Metrics, Motion, Picture
+from tasks.values import Animation, Confidence, Files, Metrics, Motion
 
 FAR = 0.95  # share of training frames beyond which a pose counts as outside
 
@@ -28,20 +27,6 @@ def evaluate_confidence(confidence: Confidence, animation: Animation, test: Moti
         angles = np.degrees(confidence.distance[clip].mean((0, 2), dtype=np.float64))
         found |= {f"query_distance@{key}, {part}": float(a) for part, a in zip(confidence.parts, angles, strict=True)}
     return declared(found, test.unit)
-
-
-def confidence_picture(confidence: Confidence, animations: dict[str, Animation], test: Motion) -> Picture:
-    """Error of some methods along the unseen frames, and what was to be expected."""
-    frames = np.arange(test.frames, dtype=float)
-    factor, unit = (1000.0, "mm") if test.unit == "m" else (1.0, "unit")
-    lines = {"expected": confidence.expected} if confidence.expected.any() else {}
-    lines |= {label: frame_rmse(animation.points, test.points) for label, animation in animations.items()}
-    series = [plot.Series(name, frames, factor * np.asarray(y, float)) for name, y in lines.items()]
-    clips = ", ".join(f"{name} from {clip.start}" for name, clip in zip(test.clip_names, test.clips(), strict=True))
-    drawing = plot.lines(series, x="unseen frame", y=f"RMSE [{unit}]")
-    return Picture(
-        "confidence", f"{test.name}: error expected from the distance to the database ({clips})", None, drawing
-    )
 
 
 def confidence_file(confidence: Confidence, test: Motion, train: Motion, *, name: str) -> Files:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tasks.evaluation.confidence import confidence_file, confidence_picture, evaluate_confidence
+from tasks.drawing.confidence import confidence_picture
+from tasks.evaluation.confidence import confidence_file, evaluate_confidence
 from tasks.methods import partmm
 from tasks.motion import confidence as module
 from tasks.motion.confidence import confidence

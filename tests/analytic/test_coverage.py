@@ -9,11 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
-from tasks.evaluation import index, video
-from tasks.evaluation.coverage import Measured, claims, cover
-from tasks.evaluation.page import size_of
-from tasks.evaluation.paper import paper_of
-from tasks.evaluation.rows import join
+from tasks.drawing import video
+from tasks.reporting import index
+from tasks.reporting.coverage import Measured, claims, cover
+from tasks.reporting.page import size_of
+from tasks.reporting.paper import paper_of
+from tasks.reporting.rows import join
 from tasks.values import Motion, Picture
 from tests.analytic.test_tables import row, table
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from tasks.evaluation import colours, figures, plot, render
+from tasks.drawing import colours, figures, plot, render
 from tasks.geometry import rigid
 from tasks.geometry.rotations import from_rotation_vector
 from tasks.values import Canonical, Clusters, Motion, Parts, Skeleton, Skinning

@@ -7,8 +7,8 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 
-from tasks.evaluation.charts import ablation_chart, clips_chart
-from tasks.evaluation.rows import join, rows_of
+from tasks.drawing.charts import ablation_chart, clips_chart
+from tasks.reporting.rows import join, rows_of
 from tasks.values import Metrics
 
 

@@ -10,11 +10,11 @@ import pytest
 
 from tasks.bones.refit import compression_floor
 from tasks.errors import InputError
-from tasks.evaluation.gains import gains, printed_gains
 from tasks.evaluation.left_out import evaluate_left_out, spread
-from tasks.evaluation.paper import Paper, PaperCell
 from tasks.geometry.measure import vertex_rmse
 from tasks.motion.left_out import leave_out
+from tasks.reporting.gains import gains, printed_gains
+from tasks.reporting.paper import Paper, PaperCell
 from tasks.values import Animation, Metrics, Motion
 from tests.analytic import planted
 

@@ -8,8 +8,8 @@ import pytest
 from tasks.errors import InputError
 from tasks.evaluation.metrics import METRICS, clip_keys, evaluate, frame_rmse, metric_of, score, unit_of
 from tasks.evaluation.rig import at_canonical, evaluate_rig
-from tasks.evaluation.rows import COLUMNS, from_csv, join, rows_of, to_csv
 from tasks.geometry import rigid
+from tasks.reporting.rows import COLUMNS, from_csv, join, rows_of, to_csv
 from tasks.values import Animation, Canonical, Metrics, Motion, Poses, Rig, Skeleton, Skinning
 
 BOX = np.array([[0, 0, 0], [3, 0, 0], [0, 4, 0], [0, 0, 12]], np.float32)  # its bounding box's diagonal is 13

@@ -11,11 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tasks.drawing import render
 from tasks.errors import InputError
-from tasks.evaluation import page, render, report
-from tasks.evaluation.report import write_report
-from tasks.evaluation.rows import from_csv, rows_of
-from tasks.evaluation.tables import build
+from tasks.reporting import page, report
+from tasks.reporting.report import write_report
+from tasks.reporting.rows import from_csv, rows_of
+from tasks.reporting.tables import build
 from tasks.values import Metrics, Picture
 
 PIXELS = Picture("errors", "errors <of> all", np.frombuffer(render.png(np.full((4, 6, 3), 200, np.uint8)), np.uint8))

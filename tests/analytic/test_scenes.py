@@ -11,8 +11,8 @@ from tasks.captures import cameras as cam
 from tasks.captures import dnerf, multiview
 from tasks.captures.raycast import Caster, solid_colour
 from tasks.captures.scenes import render_scene, scene_files, scene_motion
+from tasks.drawing.pictures import scene_picture
 from tasks.errors import InputError
-from tasks.evaluation.pictures import scene_picture
 from tasks.evaluation.scenes import evaluate_scene
 from tasks.geometry.rotations import from_rotation_vector
 from tasks.values import Motion, Rig, same

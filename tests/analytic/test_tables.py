@@ -14,11 +14,11 @@ import yaml
 from rich.console import Console
 
 from tasks.errors import InputError
-from tasks.evaluation import typeset
 from tasks.evaluation.metrics import METRICS
-from tasks.evaluation.paper import paper_of
-from tasks.evaluation.rows import join, rows_of, to_csv, with_means
-from tasks.evaluation.tables import Cell, Table, build, digits_for, ranks
+from tasks.reporting import typeset
+from tasks.reporting.paper import paper_of
+from tasks.reporting.rows import join, rows_of, to_csv, with_means
+from tasks.reporting.tables import Cell, Table, build, digits_for, ranks
 from tasks.values import Metrics
 
 ROOT = Path(__file__).resolve().parents[2]

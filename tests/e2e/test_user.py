@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tasks.evaluation.rows import COLUMNS
+from tasks.reporting.rows import COLUMNS
 from tests.e2e.conftest import Run
 
 pytestmark = pytest.mark.slow

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tasks.datasets import canonical, mesh_sequence, rigged_character
-from tasks.evaluation import figures
+from tasks.drawing import figures
 from tasks.evaluation.metrics import frame_rmse
 from tasks.geometry import measure, rigid
 from tasks.values import Skeleton, Skinning

@@ -8,8 +8,8 @@ import pytest
 from flows.report import compare, main
 from flows.shelf import made_again
 from flows.source import ROOT
-from tasks.evaluation.report import read_provenance, write_report
-from tasks.evaluation.rows import join, rows_of
+from tasks.reporting.report import read_provenance, write_report
+from tasks.reporting.rows import join, rows_of
 from tasks.values import Metrics
 
 COMMITTED = sorted(p.parent for p in (ROOT / "reports").glob("*/provenance.json"))

@@ -21,9 +21,9 @@ import numpy as np
 import pandas as pd
 
 from tasks.errors import InputError
-from tasks.evaluation import page, typeset
-from tasks.evaluation.rows import to_csv
-from tasks.evaluation.tables import Table
+from tasks.reporting import page, typeset
+from tasks.reporting.rows import to_csv
+from tasks.reporting.tables import Table
 from tasks.values import Files, Picture
 
 PROVENANCE = "provenance.json"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from jinja2 import Environment
 from markupsafe import Markup, escape
 
-from tasks.evaluation.tables import Cell, Column, Grid, Table
+from tasks.reporting.tables import Cell, Column, Grid, Table
 
 if TYPE_CHECKING:
     import rich.console
@@ -164,7 +164,7 @@ _HTML = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_
 
 
 def html(table: Table) -> str:
-    """A <figure> with the table's grids; its looks come from the page's style sheet (tasks/evaluation/page.py)."""
+    """A <figure> with the table's grids; its looks come from the page's style sheet (tasks/reporting/page.py)."""
     footnotes = table.footnotes
 
     def show(column: Column, cell: Cell) -> Markup:

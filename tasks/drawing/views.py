@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import cv2
 import numpy as np
 
-from tasks.evaluation import render
+from tasks.drawing import render
 from tasks.values import Capture
 
 SIDE = 240  # of a picture, in pixels

@@ -10,8 +10,8 @@ from typing import Any
 from jinja2 import Environment
 from markupsafe import Markup
 
-from tasks.evaluation import typeset
-from tasks.evaluation.tables import Table
+from tasks.reporting import typeset
+from tasks.reporting.tables import Table
 from tasks.values import Picture
 
 STYLE = """

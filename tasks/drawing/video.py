@@ -8,8 +8,8 @@ from collections.abc import Mapping
 import cv2
 import numpy as np
 
-from tasks.evaluation import figures, plot, render
-from tasks.evaluation.colours import CLAY, error_map
+from tasks.drawing import figures, plot, render
+from tasks.drawing.colours import CLAY, error_map
 from tasks.evaluation.metrics import frame_rmse, squared_errors, unit_of
 from tasks.values import Motion
 

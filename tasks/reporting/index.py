@@ -14,10 +14,10 @@ import numpy as np
 from jinja2 import Environment
 from markupsafe import Markup
 
-from tasks.evaluation import page, typeset
-from tasks.evaluation.coverage import Claim, Covered
 from tasks.evaluation.metrics import metric_of
-from tasks.evaluation.tables import Table, digits_for, printed_digits
+from tasks.reporting import page, typeset
+from tasks.reporting.coverage import Claim, Covered
+from tasks.reporting.tables import Table, digits_for, printed_digits
 from tasks.values import Picture
 
 WIDEST = 1280  # pixels of a picture on the page; the report's folder has it whole

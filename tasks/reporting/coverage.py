@@ -8,7 +8,7 @@ from typing import Literal
 
 import pandas as pd
 
-from tasks.evaluation.paper import Paper, PaperCell
+from tasks.reporting.paper import Paper, PaperCell
 
 Status = Literal["reproduced", "substitute data", "not run"]
 
@@ -16,7 +16,7 @@ Status = Literal["reproduced", "substitute data", "not run"]
 @dataclass(frozen=True)
 class Measured:
     """An experiment that stands beside a table of the paper. table: its number; rows: as in metrics.csv; data_status,
-    stands_for: as in :func:`tasks.evaluation.tables.build`."""
+    stands_for: as in :func:`tasks.reporting.tables.build`."""
 
     table: int
     rows: pd.DataFrame

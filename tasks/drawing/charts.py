@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 import pandas as pd
 
-from tasks.evaluation import plot
+from tasks.drawing import plot
 from tasks.evaluation.metrics import METRICS
 
 

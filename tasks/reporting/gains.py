@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pandas as pd
 
-from tasks.evaluation.paper import Paper
+from tasks.reporting.paper import Paper
 
 GAIN = "gain_pct"
 

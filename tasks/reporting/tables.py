@@ -1,4 +1,4 @@
-"""From rows of numbers to one table object; tasks/evaluation/typeset.py renders it.
+"""From rows of numbers to one table object; tasks/reporting/typeset.py renders it.
 
 A column holds one metric of one subject, in one of three kinds: what the paper prints, what was measured here, and the
 difference. Ranks are taken on unrounded means over seeds; equal values share a rank.
@@ -15,7 +15,7 @@ from typing import Literal
 import pandas as pd
 
 from tasks.evaluation.metrics import metric_of, score
-from tasks.evaluation.paper import Paper, PaperCell
+from tasks.reporting.paper import Paper, PaperCell
 
 WIDEST = 9  # columns that stand side by side on a page
 PRINTED = "printed in the paper, not run"

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from tasks.evaluation import plot, render
-from tasks.evaluation.colours import CLAY, bone_colours, error_map, part_colours, weight_map
+from tasks.drawing import plot, render
+from tasks.drawing.colours import CLAY, bone_colours, error_map, part_colours, weight_map
 from tasks.evaluation.metrics import frame_rmse, squared_errors, unit_of
 from tasks.geometry import measure
 from tasks.values import Canonical, Clusters, Motion, Parts, Skeleton, Skinning

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from tasks.evaluation import figures, render, video
-from tasks.evaluation.views import contact_sheet, views_figure
+from tasks.drawing import figures, render, video
+from tasks.drawing.views import contact_sheet, views_figure
 from tasks.geometry import kinematics, measure
 from tasks.geometry.skinning import skin
 from tasks.values import Animation, Canonical, Capture, Clusters, Motion, Parts, Picture, Poses, Skeleton, Skinning

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numba import njit
 
-from tasks.evaluation.colours import INK, PAPER
+from tasks.drawing.colours import INK, PAPER
 
 SUPERSAMPLE = 2
 

@@ -1,10 +1,15 @@
-"""The range of a number, written as an interval beside its type: ``Annotated[float, "(0, 1]"]``."""
+"""What a setting may be beyond its type, written beside it: the interval that a number lies in, and what must hold
+between it and other settings of its group: ``Annotated[float, "[0, 1)", "low < high: below high"]``."""
 
 from __future__ import annotations
 
 import re
+import typing
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
+from types import CodeType
+from typing import Annotated
 
 END = r"-?inf|-?\d+(?:\.\d*)?(?:e-?\d+)?"
 INTERVAL = re.compile(rf"([\[(])({END}), ({END})([\])])")
@@ -44,3 +49,48 @@ class Interval:
         below = f"at most {high}" if self.with_high else f"below {high}"
         ends = [above] * (self.low != float("-inf")) + [below] * (self.high != float("inf"))
         return " and ".join(ends)
+
+
+@dataclass(frozen=True)
+class Relation:
+    """A condition on the settings of a group, as Python writes it, and what it says in words for an error."""
+
+    holds: CodeType
+    words: str
+
+    @staticmethod
+    @cache
+    def of(text: str) -> Relation:
+        """From ``"condition: words"``. Raises ValueError for another text."""
+        condition, colon, words = text.partition(": ")
+        try:
+            return Relation(compile(condition, "<relation>", "eval"), words if colon else "")
+        except SyntaxError as error:
+            raise ValueError(f"{text!r} is no condition on settings: {error.msg}") from error
+
+    def __call__(self, settings: dict[str, object]) -> bool:
+        """Whether it holds for the settings, by their names."""
+        return bool(eval(self.holds, {"__builtins__": {}, "len": len, "set": set}, settings))
+
+    def others(self, name: str) -> list[str]:
+        """The settings that it is about, beside one."""
+        return [other for other in self.holds.co_names if other not in (name, "len", "set")]
+
+
+def interval(kind: object) -> Interval | None:
+    """The interval in the annotation of a number."""
+    return next((Interval.of(text) for text in kind.__metadata__ if not _is_relation(text)), None)
+
+
+def relations(kind: object) -> Iterator[Relation]:
+    """The relations in a type, at any depth."""
+    if typing.get_origin(kind) is Annotated:
+        yield from (Relation.of(text) for text in kind.__metadata__ if _is_relation(text))
+        yield from relations(kind.__origin__)
+    else:
+        for member in typing.get_args(kind):
+            yield from relations(member)
+
+
+def _is_relation(text: str) -> bool:
+    return ": " in text

@@ -1,8 +1,8 @@
 """What every key of the config may hold.
 
 The settings of a stage are the keyword-only arguments of its function, read from the source (see ``flows.source``), so
-a type, and the range of a number, are written once, where they are used, and checked before anything is computed. What
-belongs to the run and not to a stage is declared here.
+a type, the range of a number and what must hold between settings are written once, where they are used, and checked
+before anything is computed. What belongs to the run and not to a stage is declared here.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import types
 import typing
 from typing import Annotated, Literal
 
-from flows.ranges import Interval
+from flows import ranges
 from flows.source import choices, signature
 from tasks.errors import InputError, NotGiven
 
@@ -286,7 +286,19 @@ def check(config: dict, expected: dict[str, object], where: str = "") -> dict:
             out[key] = check(config[key], kind, f"{path}.")
         else:
             out[key] = _typed(config[key], kind, path)
+    _check_relations(out, expected, where)
     return out
+
+
+def _check_relations(group: dict, expected: dict[str, object], where: str) -> None:
+    """Raises InputError for the first setting that does not go with others of its group."""
+    named = group | {argument: group[key] for argument, key in RENAMED.items() if key in group}
+    for key, kind in expected.items():
+        for relation in ranges.relations(kind):
+            if not relation(named):
+                beside = " and ".join(f"{other}={named[other]}" for other in relation.others(key))
+                found = str(group[key]) + (f" with {beside}" if beside else "")
+                raise InputError(f"{where}{key}", expected=relation.words, found=found)
 
 
 def check_run(config: dict) -> dict:
@@ -345,7 +357,8 @@ def _typed(value: object, kind: object, path: str) -> object:
             return _typed(value, last, path)
     elif origin is Annotated:
         plain = _typed(value, kind.__origin__, path)
-        if plain in Interval.of(kind.__metadata__[0]):
+        span = ranges.interval(kind)
+        if span is None or plain in span:
             return plain
     elif origin is list:
         if isinstance(value, list):
@@ -370,7 +383,8 @@ def describe(kind: object) -> str:
     if typing.get_origin(kind) in UNIONS:
         return " or ".join("null" if m is type(None) else describe(m) for m in typing.get_args(kind))
     if typing.get_origin(kind) is Annotated:
-        return f"{describe(kind.__origin__)}, {Interval.of(kind.__metadata__[0])}"
+        span = ranges.interval(kind)
+        return describe(kind.__origin__) + (f", {span}" if span else "")
     if typing.get_origin(kind) is list:
         return f"a list, each entry {describe(typing.get_args(kind)[0])}"
     return {int: "a whole number", float: "a finite number", str: "text", bool: "true or false"}[kind]

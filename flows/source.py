@@ -98,7 +98,8 @@ def _tree(module: str) -> ast.Module:
 
 def _type(annotation: ast.expr | None, function: str, name: str) -> object:
     """The type an annotation names: int, float, str, bool, list[...], Literal[...] and unions of them with None; a
-    number may have the interval it lies in, as ``Annotated[float, "(0, 1]"]`` (see :mod:`flows.ranges`)."""
+    number may have the interval it lies in, any of them what must hold beside others, as ``Annotated[float, "(0, 1]"]``
+    (see :mod:`flows.ranges`)."""
     try:
         return eval(compile(ast.Expression(annotation), "<annotation>", "eval"), {"__builtins__": {}}, dict(_TYPES))
     except (NameError, TypeError, ValueError, AttributeError) as error:

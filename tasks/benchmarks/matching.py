@@ -36,7 +36,7 @@ def benchmark_matching(
     matching: dict,
     vertices: Annotated[int, "[1, inf)"],
     frames: Annotated[int, "[1, inf)"],
-    patches: list[Annotated[int, "[7, inf)"]],
+    patches: Annotated[list[Annotated[int, "[7, inf)"]], "patches: at least one size"],
     recall_queries: Annotated[int, "[1, inf)"],
     repeats: Annotated[int, "[1, inf)"],
     threads: Annotated[int, "[0, inf)"],
@@ -51,15 +51,11 @@ def benchmark_matching(
     query_ms: one new pose, all parts, distances of the poses before it kept (by patches: "query_ms@100000");
     recall_at_7: share of the 7 truly nearest windows that are found, over all sizes; build_seconds and memory: of a
     database of 10,000 frames.
-    Raises InputError for fewer frames than two patches and for no sizes.
+    Raises InputError for fewer frames than two patches.
     """
     way = Way(**matching)
-    for name, good, expected, found in (
-        ("frames", frames >= 2 * way.patch, "at least two patches", frames),
-        ("patches", patches, "at least one size", patches),
-    ):
-        if not good:
-            raise InputError(f"benchmark.{name}", expected=expected, found=str(found))
+    if frames < 2 * way.patch:
+        raise InputError("benchmark.frames", expected="at least two patches", found=str(frames))
     training = _of_size(training, vertices, frames)
     with threads_held(threads):
         found = _pose_by_pose(training, query, way, repeats) | _whole_clips(training, query, way, repeats)

@@ -30,9 +30,9 @@ Work = Callable[[], object]
 def benchmark_rasterizer(
     canonical: Canonical,
     *,
-    gaussians: list[Annotated[int, "[4, inf)"]],
-    sizes: list[Annotated[int, "[8, inf)"]],
-    threads: list[Annotated[int, "[1, inf)"]],
+    gaussians: Annotated[list[Annotated[int, "[4, inf)"]], "gaussians: at least one"],
+    sizes: Annotated[list[Annotated[int, "[8, inf)"]], "sizes: at least one"],
+    threads: Annotated[list[Annotated[int, "[1, inf)"]], "threads: at least one"],
     repeats: Annotated[int, "[1, inf)"],
     seed: int,
 ) -> Metrics:
@@ -41,10 +41,10 @@ def benchmark_rasterizer(
     gaussians: their numbers; sizes: of the square image, in pixels; threads: for ours, while Warp has one on the
     processor; repeats: runs whose median is taken, ours and the peer's in turn, after one that only warms up. Every
     case is named by the three, as "step_ms@5000 at 128 px, 1 thread". Without a case's name: the largest ratio of all
-    cases with the fewest threads. Raises InputError where the extra is missing, the shape has no faces or
-    nothing is asked for.
+    cases with the fewest threads. Raises InputError where the extra is missing or the shape has no faces.
     """
-    _check(canonical, {"gaussians": gaussians, "sizes": sizes, "threads": threads})
+    if canonical.faces is None:
+        raise InputError("Canonical.faces", expected="triangles to lay Gaussians on", found="bare points")
     peer = _library()
     found: dict[str, float] = {}
     for count in gaussians:
@@ -147,11 +147,3 @@ def _library() -> type:
 def _worst(found: dict[str, float], case: str) -> dict[str, float]:
     ratios = ("time_ratio", "forward_ratio")
     return {r: max(v for name, v in found.items() if name.startswith(f"{r}@") and case in name) for r in ratios}
-
-
-def _check(canonical: Canonical, settings: dict[str, list[int]]) -> None:
-    if canonical.faces is None:
-        raise InputError("Canonical.faces", expected="triangles to lay Gaussians on", found="bare points")
-    for name, values in settings.items():
-        if not values:
-            raise InputError(f"benchmark.{name}", expected="at least one", found="none")

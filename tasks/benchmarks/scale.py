@@ -30,7 +30,7 @@ def scale_bones(
     clustering: dict,
     decomposition: dict,
     subdivisions: Annotated[int, "[1, 5]"],
-    shares: list[Annotated[float, "(0, 1]"]],
+    shares: Annotated[list[Annotated[float, "(0, 1]"]], "len(set(shares)) > 1: two or more"],
     repeats: Annotated[int, "[1, inf)"],
     threads: Annotated[int, "[0, inf)"],
 ) -> tuple[Metrics, Picture]:
@@ -39,9 +39,10 @@ def scale_bones(
     clustering, decomposition: the settings of :func:`cluster` and :func:`ssdr`; subdivisions: how often every triangle
     is cut in four; shares: of the frames, from the first on; repeats: runs whose median is taken; threads: 0 for all
     cores. An exponent is the slope of the logarithm of processor time: 1 is linear. Seconds and memory are those of the
-    finest mesh. Raises InputError for bare points and fewer than two shares.
+    finest mesh. Raises InputError for bare points.
     """
-    _check(motion, shares)
+    if motion.faces is None:
+        raise InputError("Motion.faces", expected="triangles, which are made finer", found="bare points")
 
     def time(data: Motion, shape: Canonical) -> tuple[int, int, Cost]:
         def work() -> object:
@@ -104,10 +105,3 @@ def _picture(name: str, finer: Timed, longer: Timed) -> Picture:
         series.append(plot.Series(label, size, np.array([cost.cpu for _, _, cost in timed])))
     drawing = plot.lines(series, x="points × frames [millions]", y="processor time [s]", log_x=True, log_y=True)
     return Picture("scale", f"{name}: cost of the bones against points and frames", None, drawing)
-
-
-def _check(motion: Motion, shares: list[float]) -> None:
-    if motion.faces is None:
-        raise InputError("Motion.faces", expected="triangles, which are made finer", found="bare points")
-    if len(set(shares)) < 2:
-        raise InputError("benchmark.shares", expected="two or more", found=str(shares))

@@ -20,7 +20,6 @@ from tasks.bones.clustering import split
 from tasks.bones.graph import Graph, moving_together
 from tasks.bones.losses import losses
 from tasks.bones.trajectories import Trajectories, compress
-from tasks.errors import InputError
 from tasks.geometry.measure import vertex_rmse
 from tasks.geometry.skinning import skin
 from tasks.values import Canonical, Clusters, Motion, Skinning
@@ -50,7 +49,7 @@ def ssdr(
     smoothness: Annotated[float, "[0, inf)"],
     locality: Annotated[float, "[0, inf)"],
     compression: Annotated[float, "(0, inf)"],
-    prune: Annotated[float, "[0, 1)"],
+    prune: Annotated[float, "[0, 1)", "prune * influences < 1: below 1 / influences"],
     seed: int,
 ) -> Skinning:
     """Weights W (N, B) and rigid transforms T (F, B, 3, 4) that minimise sum |sum_b w_nb T_fb v_n - x_fn|^2.
@@ -64,11 +63,9 @@ def ssdr(
     rounds. B is the number of clusters. Points that move like nothing around them get weights but do not move bones.
     Cost: linear in N and in F.
     history: vertex RMSE after every round, of the sample first, the last exactly that of the result.
-    Raises InputError where prune could take all weights of a point. Source: Le & Deng, SIGGRAPH Asia 2012, eq. 2-8,
+    Source: Le & Deng, SIGGRAPH Asia 2012, eq. 2-8,
     solved as described in the modules named above.
     """
-    if not prune * influences < 1.0:
-        raise InputError("bones.prune", expected="below 1 / influences", found=str(prune))
     rng = np.random.default_rng(seed)
     sound = clusters.sound
     good = np.nonzero(sound)[0]

@@ -21,7 +21,11 @@ def animate(
     represent: Literal["root", "part", "residual"],
     align: bool,
     dynamics: Annotated[float, "[0, inf)"],
-    shrink: bool,
+    shrink: Annotated[
+        bool,
+        "not shrink or represent == 'residual': false without represent=residual (there is nothing to shrink towards)",
+        "not (shrink and sources): false with sources (they are not shrunk)",
+    ],
     mirror: bool,
     sources: Annotated[int, "[0, inf)"],
 ) -> Animation:

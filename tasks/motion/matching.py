@@ -23,8 +23,7 @@ from tasks.values import Poses, Training
 
 @dataclass(frozen=True)
 class Way:
-    """How to match, as :func:`tasks.methods.partmm.animate` explains it. Raises InputError for settings that exclude
-    each other."""
+    """How to match, as :func:`tasks.methods.partmm.animate` explains it."""
 
     k: int
     patch: int
@@ -37,13 +36,6 @@ class Way:
     shrink: bool
     mirror: bool
     sources: int
-
-    def __post_init__(self) -> None:
-        if self.shrink and self.represent != "residual":
-            expected = "false without represent=residual (there is nothing to shrink towards)"
-            raise InputError("animate.shrink", expected=expected, found="true")
-        if self.shrink and self.sources:
-            raise InputError("animate.shrink", expected="false with sources (they are not shrunk)", found="true")
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,11 @@ def find_parts(
     skinning: Skinning,
     *,
     kind: Literal["auto", "whole", "named"],
-    named: list[str],
+    named: Annotated[
+        list[str],
+        "named or kind != 'named': one part or more, as 'arms=arm_l,arm_r', with kind=named",
+        "not named or kind == 'named': nothing without kind=named",
+    ],
     overlap: Annotated[int, "[0, inf)"],
     affinity: Annotated[float, "[0, 1)"],
 ) -> Parts:
@@ -175,8 +179,6 @@ def _named(skeleton: Skeleton, moves: np.ndarray, named: list[str]) -> dict[str,
                 found=f"'{unknown[0]}' in part '{part.strip()}'",
             )
         groups[part.strip()] = np.isin(np.arange(len(moves)), [index[m] for m in chosen])
-    if not groups:
-        raise InputError("parts.named", expected="at least one part", found="none", do='e.g. ["arms=arm_l,arm_r", ...]')
     forgotten = moves & ~np.any(list(groups.values()), axis=0) & (skeleton.weights.sum(0) > 0)
     if forgotten.any():
         names = ", ".join(np.array(skeleton.names)[forgotten])

@@ -129,7 +129,6 @@ def test_liveliness_by_hand():
         ([5], "clips", [], 0.5, "set split.by=frames"),
         ([5, 5], "frames", [], 0.01, "expected test frames, found zero"),
         ([5, 5], "frames", [], 0.99, "expected training frames, found zero"),
-        ([5, 5], "frames", ["clip0"], 0.5, "split.by=frames"),
     ],
 )
 def test_impossible_splits(lengths, by, test, fraction, says):

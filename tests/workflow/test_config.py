@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 
@@ -32,6 +33,7 @@ def test_every_choice_composes(group):
     for choice in GROUPS[group]:
         extra = ["dataset.path=some.npz"] if group == "dataset" and choice in NEEDS_PATH else []
         extra += ["reconstruction=cpu"] if group in OF_A_FIT else []
+        extra += ["split.test=[]"] if choice == "frames" else []  # the creatures name their clips
         sweep = ["sweep.datasets=null", "sweep.methods=null"]
         assert config.expand([f"{group}={choice}", *extra, *sweep])
 
@@ -95,6 +97,14 @@ def one_line(error: InputError) -> str:
         (["seed=x"], ["seed", "a whole number"]),
         (["split.test=3"], ["split.test", "a list"]),
         (["report.name=${nothing}"], ["nothing"]),
+        (["bones.prune=0.3"], ["bones.prune", "below 1 / influences", "0.3 with influences=4"]),
+        (["animate.shrink=true"], ["animate.shrink", "represent=residual", "True with represent=root"]),
+        (["method=partmm_plus", "animate.shrink=true"], ["animate.shrink", "false with sources", "sources=100"]),
+        (["split.by=frames"], ["split.test", "[] where by=frames", "with by=frames", "['gallop', 'jump']"]),
+        (["parts.kind=named"], ["parts.named", "one part or more", "arms=arm_l,arm_r"]),
+        (["parts.named=['all=body']"], ["parts.named", "nothing without kind=named", "kind=auto"]),
+        (["+experiment=benchmark_rasterizer", "benchmark.sizes=[]"], ["benchmark.sizes", "at least one", "found []"]),
+        (["+experiment=scale_bones", "benchmark.shares=[1,1]"], ["benchmark.shares", "two or more"]),
     ],
     ids=lambda v: " ".join(v) if isinstance(v, list) else "",
 )
@@ -268,6 +278,27 @@ def test_intervals(text, inside, outside, words):
     assert all(number in span for number in inside)
     assert not any(number in span for number in outside)
     assert str(span) == words
+
+
+def test_relations_are_about_settings_of_one_function():
+    named = set(re.findall(r"tasks\.[\w.]+:\w+", (ROOT / "flows/schema.py").read_text("utf-8")))
+    stages = named | {schema.animate_function(path.stem) for path in (ROOT / "tasks/methods").glob("[!_]*.py")}
+    found = 0
+    for stage in stages:
+        settings = source.signature(stage)[1]
+        for name, kind in settings.items():
+            for relation in ranges.relations(kind):
+                assert name in relation.holds.co_names, f"{stage} {name}: {relation.words}"
+                assert {*relation.others(name)} <= {*settings}
+                assert relation.words
+                found += 1
+    assert found > 7
+
+
+@pytest.mark.parametrize("text", ["a <: b", "a < : b", "1 2: words", "a = b: words"])
+def test_what_is_no_condition_is_a_defect_of_ours(text):
+    with pytest.raises(ValueError, match="condition"):
+        ranges.Relation.of(text)
 
 
 @pytest.mark.parametrize("text", ["0..1", "[1, 0]", "[1, 1)", "1 or more", "[0 1]"])

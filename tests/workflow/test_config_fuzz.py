@@ -70,7 +70,7 @@ def odd(kind: object) -> st.SearchStrategy:
     numbers = st.sampled_from([0, -1, 1, 2**63, -(2**64), 10**30, 10**400, 0.0, -0.5, 1e-320, 1e31, -1e308])
     beyond = st.sampled_from([float("nan"), float("inf"), float("-inf")])
     if typing.get_origin(kind) is typing.Annotated:
-        return st.one_of(odd(kind.__origin__), st.sampled_from(outside(kind)))
+        return st.one_of(odd(kind.__origin__), *[st.sampled_from(beyond) for beyond in [outside(kind)] if beyond])
     return {int: numbers | beyond, float: numbers | beyond, str: WORDS, bool: st.booleans()}.get(kind, st.none())
 
 
@@ -107,7 +107,9 @@ def outside(kind: object) -> list[object]:
         return [[value] for value in outside(typing.get_args(kind)[0])]
     if typing.get_origin(kind) is not typing.Annotated:
         return []
-    span, step = ranges.Interval.of(kind.__metadata__[0]), 1 if kind.__origin__ is int else 1e-9
+    span, step = ranges.interval(kind), 1 if kind.__origin__ is int else 1e-9
+    if span is None:
+        return outside(kind.__origin__)
     below = [] if span.low == -math.inf else [span.low - step if span.with_low else span.low]
     above = [] if span.high == math.inf else [span.high + step if span.with_high else span.high]
     return [kind.__origin__(value) for value in below + above]

@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from flows.source import ROOT
 from tasks.reporting.rows import COLUMNS
 from tests.e2e.conftest import Run
 
@@ -187,3 +188,16 @@ def _alive(pid: int) -> bool:
     import psutil
 
     return psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+
+
+def test_the_readmes_lines_for_a_notebook_give_the_numbers_of_a_run(user, small_file):
+    one = ["dataset=mesh_sequence", f"dataset.path={small_file}", "method=partmm", "animate.k=5"]
+    user(*one, "sweep.datasets=null", "sweep.methods=null", "report.figures=false")
+    rows = pd.read_csv(user.folder / "reports" / "quick" / "metrics.csv").set_index("metric")["value"]
+    (lines,) = re.findall(
+        r"```python\n(from flows\.notebook.*?)```", (ROOT / "README.md").read_text("utf-8"), re.DOTALL
+    )
+    found: dict = {}
+    exec(lines.replace("dataset.path=FILE.npz", f"dataset.path={small_file}"), found)
+    scores = found["scores"]
+    assert dict(zip(scores.names, scores.values, strict=True)) == {name: rows[name] for name in scores.names}

@@ -6,12 +6,16 @@ import io
 
 import numpy as np
 
+from tasks.errors import InputError
 from tasks.export.bvh import write_bvh
 from tasks.export.glb import Character, write_glb
-from tasks.geometry import rigid
+from tasks.geometry import kinematics, rigid
+from tasks.geometry.measure import diagonal
+from tasks.geometry.skinning import skin
 from tasks.values import Animation, Canonical, Files, Motion, Poses, Skeleton, Skinning
 
 FOLDER = "export"  # in a report
+CLOSE = 1e-4  # of the diagonal: points that lie this near are the same
 
 
 def bones_glb(
@@ -27,9 +31,19 @@ def bones_glb(
     """The canonical shape on the free-form bones, moving as the method says, or without one as fitted.
 
     motion: whose clips the frames are, for names and rate; the bones stand side by side, each at the centre of what it
-    moves. A method that moves no bones gets :func:`skeleton_glb` instead.
+    moves. A method that moves no bones gets :func:`skeleton_glb` instead; InputError where its points are not what the
+    skeleton's weights make of the poses (BBW and fitted weights), as that file would show another method.
     """
     if animation is not None and animation.bones is None:
+        posed = kinematics.forward(skeleton.parents, skeleton.joints, poses.rotations, poses.translations)
+        off = np.abs(skin(canonical.points, skeleton.weights, posed) - animation.points).max()
+        if off > CLOSE * diagonal(canonical.points):
+            raise InputError(
+                "export.formats",
+                expected="a method that moves bones, or the skeleton with its own weights",
+                found="glb: points that neither moves",
+                do="take npz, which holds the points, or skeleton_glb, which holds the poses",
+            )
         return skeleton_glb(canonical, skeleton, motion, poses, name=name)
     transforms = skinning.transforms if animation is None else animation.bones
     bones = transforms.shape[1]

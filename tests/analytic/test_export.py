@@ -12,6 +12,7 @@ import trimesh
 
 from tasks.datasets import gltf, mesh_sequence
 from tasks.datasets.rigging import to_motion
+from tasks.errors import InputError
 from tasks.export import bvh, character, glb
 from tasks.geometry import kinematics, rigid
 from tasks.geometry.rotations import from_quaternion, from_rotation_vector, geodesic
@@ -92,13 +93,21 @@ def test_bones_in_motion_come_back(tmp_path, influences):
 
 
 def test_a_method_without_bones_gets_its_skeleton(case, tmp_path):
-    files = character.bones_glb(*case.values, Animation(points=case.points), name="blob")
+    posed = kinematics.forward(PARENTS, JOINTS, case.poses.rotations, case.poses.translations)
+    points = skin(case.canonical.points, case.skeleton.weights, posed)
+    files = character.bones_glb(*case.values, Animation(points=points), name="blob")
     assert files.paths == ("export/blob_skeleton.glb",)
     motion = read_back(only(files), tmp_path)
-    posed = kinematics.forward(PARENTS, JOINTS, case.poses.rotations, case.poses.translations)
-    match(motion.points, skin(case.canonical.points, case.skeleton.weights, posed))
+    match(motion.points, points)
     assert motion.rig.names == case.skeleton.names
     np.testing.assert_array_equal(motion.rig.parents, PARENTS)
+
+
+def test_weights_of_a_methods_own_are_not_passed_off_as_the_skeletons(case):
+    posed = kinematics.forward(PARENTS, JOINTS, case.poses.rotations, case.poses.translations)
+    other = np.roll(case.skeleton.weights, 1, axis=1)
+    with pytest.raises(InputError, match="take npz"):
+        character.bones_glb(*case.values, Animation(points=skin(case.canonical.points, other, posed)), name="blob")
 
 
 def test_others_read_the_mesh(case):

@@ -273,9 +273,9 @@ def _bar(height: int, colour: Callable, top: float, unit: str, theme: str, low: 
     s = render.SUPERSAMPLE
     ramp = render.to_bytes(colour(np.linspace(1, 0, tall * s)))
     canvas[first * s : (first + tall) * s, 10 * s : 26 * s] = ramp[:, None]
-    for share in (0.0, 0.25, 0.5, 0.75, 1.0):
-        y = first + tall * (1 - share)
-        value = low + share * (top - low)
+    step = plot.round_up((top - low) / 5, (1, 2, 5, 10))
+    for value in np.arange(low, top + step / 2, step):
+        y = first + tall * (top - value) / (top - low)
         render.text(canvas, f"{value:.3g}", (32, y + 5), size=13, theme=theme)
     render.text(canvas, unit, (10, first - 16), size=13, theme=theme)
     return canvas

@@ -14,6 +14,7 @@ from tasks.geometry.measure import vertex_rmse
 from tasks.geometry.rotations import from_rotation_vector, geodesic
 from tasks.geometry.skinning import skin
 from tasks.geometry.sparse_weights import fit_weights
+from tasks.skeleton import joints_motion
 from tasks.skeleton.articulation import centres, off_hinges
 from tasks.skeleton.body import Body
 from tasks.skeleton.curve_weights import onto_surface
@@ -57,6 +58,34 @@ def test_a_ball_joint_is_found(topology):
     assert len(skeleton.joints) == 2
     np.testing.assert_allclose(skeleton.joints[1], [1.0, 0.0, 0.0], atol=0.02)
     assert lbs_error(shape, skeleton) < 2e-3
+
+
+def test_a_shape_far_from_the_origin_is_brought_near_before_bones_are_extrapolated(monkeypatch):
+    """Extrapolated as a turn about the origin and a shift, bones a thousand lengths away from it overshot."""
+    shape, far = ball_joint(), np.array([2000.0, -800.0, 1500.0], np.float32)
+    near = find(shape)
+    transforms = shape.skinning.transforms.astype(np.float64)
+    transforms[..., 3] += far - transforms[..., :3] @ far
+    moved = (
+        replace(shape.motion, points=shape.motion.points + far),
+        replace(shape.canonical, points=shape.canonical.points + far),
+        replace(shape.skinning, rest=shape.skinning.rest + far, transforms=transforms.astype(np.float32)),
+        replace(shape.surface, vertices=shape.surface.vertices + far),
+        replace(shape.curve, nodes=shape.curve.nodes + far),
+    )
+    seen = []
+
+    def few_bones(bones: Bones, *rest, **settings) -> Bones:
+        seen.append(vertex_rmse(skin(bones.rest, bones.weights, bones.transforms), bones.paths))
+        assert np.abs(bones.rest).max() < 3.0
+        return chosen(bones, *rest, **settings)
+
+    chosen = joints_motion.few_bones
+    monkeypatch.setattr(joints_motion, "few_bones", few_bones)
+    skeleton = joints_by_motion(*moved, **SETTINGS)
+    assert seen[0] < 2e-3  # of float32 coordinates up to 2,700
+    np.testing.assert_array_equal(skeleton.parents, near.parents)
+    np.testing.assert_allclose(skeleton.joints - far, near.joints, atol=0.02)
 
 
 def test_a_hinge_is_found_though_it_is_free_along_its_axis():

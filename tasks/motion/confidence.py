@@ -7,6 +7,7 @@ from typing import Annotated
 
 import numpy as np
 
+from tasks.geometry.measure import diagonal
 from tasks.motion.matching import one_clip
 from tasks.motion.posed import Posed
 from tasks.motion.query import check_poses
@@ -15,7 +16,7 @@ from tasks.motion.search import nearest_windows
 from tasks.values import Confidence, Poses, Training
 
 LEAST = 5  # frames that a line is fitted to
-TINY = 1e-4  # radians and body units below which differences mean nothing
+TINY = 1e-4  # radians, and diagonals of the body, below which differences mean nothing
 
 
 def confidence(
@@ -62,7 +63,8 @@ def _calibrated(
     others, apart = map(np.concatenate, zip(*map(left_out, judged), strict=True))
     seen = apart.mean((1, 2), dtype=np.float64)
     outside = np.searchsorted(np.sort(seen), far) / len(seen)
-    slope, level = np.polyfit(np.log(seen + TINY), np.log(_errors(training, known, others, frames) + TINY), 1)
+    least = TINY * diagonal(training.canonical.points)
+    slope, level = np.polyfit(np.log(seen + TINY), np.log(_errors(training, known, others, frames) + least), 1)
     return np.exp(level + max(slope, 0.0) * np.log(far + TINY)), outside
 
 

@@ -21,10 +21,14 @@ def fit_weights(
 
     |sum_j w_j T_fj v - x_f|^2 summed over frames is w^T G w - 2 b^T w per point, where G needs the frames only through
     sum_f T_fj^T T_fk: its cost does not grow with the points. Solved by projected gradient onto the simplex, then
-    again on the largest ``influences``.
+    again on the largest ``influences``. All is seen from the shape's centre, for G, and with it the pull to ``start``,
+    would grow with the distance from the origin.
     """
     frames, joints = transforms.shape[:2]
-    flat = transforms.astype(np.float64).transpose(0, 2, 1, 3).reshape(frames * 3, joints * 4)
+    centre = rest.mean(0, dtype=np.float64)
+    rest, points, transforms = rest - centre, points - centre, transforms.astype(np.float64)
+    transforms[..., 3] += transforms[..., :3] @ centre - centre
+    flat = transforms.transpose(0, 2, 1, 3).reshape(frames * 3, joints * 4)
     pairs = (flat.T @ flat).reshape(joints, 4, joints, 4)
     targets = (flat.T @ points.astype(np.float64).transpose(0, 2, 1).reshape(frames * 3, -1)).reshape(joints, 4, -1)
     homogeneous = np.concatenate([rest, np.ones((len(rest), 1))], axis=1).astype(np.float64)

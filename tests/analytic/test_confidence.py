@@ -10,7 +10,7 @@ from tasks.evaluation.confidence import confidence_file, evaluate_confidence
 from tasks.methods import partmm
 from tasks.motion import confidence as module
 from tasks.motion.confidence import confidence
-from tasks.values import Animation, Poses
+from tasks.values import Animation, Confidence, Poses
 from tests.analytic import planted
 from tests.analytic.test_methods import PAPER
 
@@ -109,3 +109,18 @@ def test_clips_shorter_than_a_patch_are_padded(train):
     poses = planted.poses(CLIPS)
     short = Poses(poses.rotations[:3], poses.translations[:3], np.array([0, 3]))
     assert len(confidence(train, short, **SETTINGS).expected) == 3
+
+
+def test_outside_counts_the_frames_beyond_95_percent_clip_by_clip(train):
+    test = train.motion.take_frames([slice(0, 4), slice(60, 66)], ["near", "far"])
+    outside = np.array([0.0, 0.5, 0.95, 0.96, 1.0, 1.0, 0.99, 0.2, 0.94, 1.0], np.float32)
+    told = Confidence(
+        np.zeros((10, 1, 1), np.int32), np.full((10, 1, 1), 0.5, np.float32), np.ones(10, np.float32), outside, ("all",)
+    )
+    found = evaluate_confidence(told, Animation(test.points), test)
+    named = dict(zip(found.names, found.values, strict=True))
+    assert named["outside_pct"] == pytest.approx(50.0)
+    assert named["outside_pct@near"] == pytest.approx(25.0)
+    assert named["outside_pct@far"] == pytest.approx(100.0 * 4 / 6)
+    assert named["query_distance@far, all"] == pytest.approx(np.degrees(0.5), rel=1e-6)
+    assert "confidence_spearman" not in named  # an expectation that never changes ranks nothing

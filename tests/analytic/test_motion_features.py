@@ -1,0 +1,66 @@
+"""What poses are told by: velocities of a known motion, distances in radians."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tasks.geometry import rigid
+from tasks.geometry.rotations import from_rotation_vector
+from tasks.motion.dynamics import root_dynamics
+from tasks.motion.posed import DYNAMICS, Posed
+from tasks.motion.regression import bone_radii, features
+from tasks.values import Poses
+from tests.analytic import planted
+
+
+@pytest.mark.parametrize("fps", [30.0, 60.0, 1.0])
+def test_dynamics_of_an_even_spin_on_a_parabola(fps):
+    """Turning once in two seconds about the upright while being thrown: all in the root's own axes."""
+    frames = 24
+    time, spin = np.arange(2 * frames) / fps, np.pi / fps  # rad a frame, up to half a turn
+    turn = from_rotation_vector(np.arange(2 * frames)[:, None] * np.array([0.0, min(spin, 0.5), 0.0]))
+    pivot = np.array([0.2, 1.0, -0.1])
+    place = np.stack([0.7 * time, 3.0 * time - 4.9 * time**2, 0 * time], axis=1)
+    root = rigid.make(turn, place + pivot - (turn @ pivot[:, None])[..., 0])
+    found = root_dynamics(root, pivot, np.array([0, frames, 2 * frames]), fps)
+    inner = np.r_[2 : frames - 2, frames + 2 : 2 * frames - 2]
+    np.testing.assert_allclose(found[:, 0], np.broadcast_to([0.0, 1.0, 0.0], (2 * frames, 3)), atol=1e-9)
+    velocity = np.stack([0 * time + 0.7, 3.0 - 9.8 * time, 0 * time], axis=1)
+    np.testing.assert_allclose((turn @ found[:, 1, :, None])[inner, :, 0], velocity[inner], atol=1e-8)
+    np.testing.assert_allclose((turn @ found[:, 2, :, None])[inner, :, 0], [[0.0, -9.8, 0.0]] * len(inner), atol=1e-7)
+    np.testing.assert_allclose(found[:, 3], [[0.0, fps * min(spin, 0.5), 0.0]] * (2 * frames), atol=1e-8)
+
+
+def test_squared_distances_of_features_are_mean_squared_angles():
+    train = planted.training([planted.gesture(20, 1)], affinity=0.0)
+    turns = np.tile(np.eye(3, dtype=np.float32), (2, len(planted.NAMES), 1, 1))
+    joints, weights = np.array([4, 5, 10]), np.array([1.0, 3.0, 2.0])
+    angles = np.array([0.02, 0.05, 0.03])
+    turns[1, joints] = from_rotation_vector(angles[:, None] * np.array([[1.0, 0, 0], [0, 1.0, 0], [0, 0.6, 0.8]]))
+    still = Poses(turns, np.zeros((2, len(planted.NAMES), 3), np.float32), np.array([0, 1, 2]))  # two clips: no motion
+    x = features(Posed(train, still), joints, weights, dynamics=1.0, lags=[0, 1, 4])
+    apart = ((x[0] - x[1]) ** 2).sum()
+    assert apart == pytest.approx(float(weights @ angles**2 / weights.sum()), rel=2e-3)
+
+
+def test_a_step_sideways_counts_by_the_size_of_the_body():
+    """Body diagonals a second, whatever the unit; half a diagonal a second here."""
+    train = planted.training([planted.gesture(20, 1)], affinity=0.0)
+    size = np.linalg.norm(np.ptp(train.canonical.points, axis=0))
+    rest = np.tile(np.eye(3, dtype=np.float32), (20, len(planted.NAMES), 1, 1))
+    shift = np.zeros((20, len(planted.NAMES), 3), np.float32)
+    shift[:, 0, 0] = 0.5 * size * np.arange(20) / train.database.fps
+    posed = Posed(train, Poses(rest, shift, np.array([0, 20])))
+    wanted = np.zeros((20, 4, 3))
+    wanted[:, 0, 1], wanted[:, 1, 0] = DYNAMICS[0], 0.5 * DYNAMICS[1]
+    np.testing.assert_allclose(posed.dynamics, wanted, atol=1e-4)
+
+
+def test_a_bone_s_radius_is_the_root_of_its_mean_squared_distance():
+    ring = np.stack([np.cos(np.arange(12)), np.sin(np.arange(12)), np.zeros(12)], axis=1)
+    ring -= ring.mean(0)
+    rest = np.concatenate([2.0 * ring, 3.0 * ring + 10.0]).astype(np.float32)
+    weights = np.repeat(np.eye(2), 12, axis=0)
+    spread = np.sqrt((ring**2).sum(1).mean())
+    np.testing.assert_allclose(bone_radii(rest, weights), [2.0 * spread, 3.0 * spread], rtol=1e-5)

@@ -7,6 +7,7 @@ import pytest
 
 from tasks.geometry import rigid
 from tasks.geometry.rotations import from_rotation_vector
+from tasks.motion import kernel
 from tasks.motion.dynamics import root_dynamics
 from tasks.motion.posed import DYNAMICS, Posed
 from tasks.motion.regression import bone_radii, features
@@ -64,3 +65,18 @@ def test_a_bone_s_radius_is_the_root_of_its_mean_squared_distance():
     weights = np.repeat(np.eye(2), 12, axis=0)
     spread = np.sqrt((ring**2).sum(1).mean())
     np.testing.assert_allclose(bone_radii(rest, weights), [2.0 * spread, 3.0 * spread], rtol=1e-5)
+
+
+@pytest.mark.parametrize("helps", [True, False])
+def test_images_are_learnt_from_only_where_left_out_clips_are_met_better(helps):
+    """An odd function known on its right half but for one clip: images tell of the left one, or lie."""
+    rng = np.random.default_rng(0)
+    x = np.concatenate([rng.uniform(a, b, (30, 1)) for a, b in ((0.5, 3), (0.5, 3), (-3, -0.5))])
+    y = np.concatenate([np.sin(x), x], axis=1)
+    clip = np.repeat(np.arange(3), 30)
+    image = -x, (-y if helps else rng.normal(0, 2, y.shape))
+    model = kernel.fit(x, y, clip, width=1.0, ridge=0.01, tune=True, landmarks=1000, more=image)
+    assert len(model.centres) == (180 if helps else 90)
+    if helps:
+        asked = np.linspace(-2.5, 2.5, 9)[:, None]
+        np.testing.assert_allclose(model(asked), np.concatenate([np.sin(asked), asked], axis=1), atol=0.1)

@@ -13,9 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from tasks.reconstruction import rasterize
+
 wp.config.quiet = True
 
-EPS2D = wp.constant(0.3)
+EPS2D = wp.constant(rasterize.EPS2D)
 MAX_ALPHA = wp.constant(0.999)
 MIN_ALPHA = wp.constant(1.0 / 255.0)
 FLOOR = wp.constant(1e-4)

@@ -10,7 +10,7 @@ import torch
 
 from tasks.errors import InputError
 from tasks.reconstruction import rasterize_reference
-from tasks.reconstruction.rasterize import MAX_ALPHA, MIN_ALPHA, rasterize
+from tasks.reconstruction.rasterize import EPS2D, MAX_ALPHA, MIN_ALPHA, rasterize
 from tasks.reconstruction.ssim import ssim
 
 SIZE = (29, 37)  # no multiple of the tiles
@@ -114,7 +114,8 @@ def test_projection_is_that_of_gsplat(isotropic):
     covariance = theirs._quat_scale_to_covar_preci(turn, scales.expand(-1, 3), True, False, False)[0]
     assert apart(rasterize_reference.covariance(scales, quaternions), covariance) < 1e-12
     size = (SIZE[1], SIZE[0])
-    radii, xy, depth, conic, _ = theirs._fully_fused_projection(means, covariance, view[None], intrinsics[None], *size)
+    camera = view[None], intrinsics[None], *size
+    radii, xy, depth, conic, _ = theirs._fully_fused_projection(means, covariance, *camera, eps2d=EPS2D)
     seen = (radii[0] > 0).all(-1)
     assert 10 < int(seen.sum()) < len(means)
     ours_xy, ours_cov, ours_depth = rasterize_reference.project(means, covariance, view, intrinsics, SIZE)
@@ -130,7 +131,7 @@ def test_projection_is_that_of_gsplat(isotropic):
 
 @pytest.mark.parametrize("backend", ["numba", "reference", NEEDS_CUDA])
 class TestOneGaussian:
-    """Worked out by hand: on the axis, at depth 2, focal length 10, scale 0.4 -> 2 pixels, blurred to 2^2 + 0.3."""
+    """Worked out by hand: on the axis, at depth 2, focal length 10, scale 0.4 -> 2 pixels, blurred to 2^2 + 0.1."""
 
     def draw(self, backend, *, opacity=0.8, means=((0.0, 0.0, 2.0),), colours=((0.9, 0.3, 0.1),), size=(9, 9)):
         device = "cuda" if backend == "gsplat" else "cpu"
@@ -151,14 +152,14 @@ class TestOneGaussian:
     def test_falls_off_as_a_gaussian_round_the_pixel_centre(self, backend):
         rgb, alpha, depth = self.draw(backend)
         assert alpha[4, 4] == pytest.approx(0.8, rel=1e-5)  # the centre lies on the centre of pixel 4
-        assert alpha[4, 6] == pytest.approx(0.8 * math.exp(-0.5 * 4 / 4.3), rel=1e-5)
-        assert alpha[1, 4] == pytest.approx(0.8 * math.exp(-0.5 * 9 / 4.3), rel=1e-5)
+        assert alpha[4, 6] == pytest.approx(0.8 * math.exp(-0.5 * 4 / 4.1), rel=1e-5)
+        assert alpha[1, 4] == pytest.approx(0.8 * math.exp(-0.5 * 9 / 4.1), rel=1e-5)
         assert depth[3, 5] == pytest.approx(2.0, rel=1e-5)
         assert rgb[4, 4] == pytest.approx([0.72, 0.24, 0.08 + 0.2], rel=1e-4)
 
     def test_ends_where_alpha_is_below_the_least(self, backend):
         _, alpha, depth = self.draw(backend, opacity=0.02)
-        inside = 0.02 * np.exp(-0.5 * ((np.arange(9) - 4) ** 2) / 4.3) >= MIN_ALPHA
+        inside = 0.02 * np.exp(-0.5 * ((np.arange(9) - 4) ** 2) / 4.1) >= MIN_ALPHA
         assert np.array_equal(alpha[4] > 0, inside)
         assert 0 < inside.sum() < 9
         assert (depth[4, ~inside] == 0).all()

@@ -306,7 +306,7 @@ def test_hidden_gaussians_are_taken_out_at_the_end_of_division(tmp_path):
     centre = points.mean(1)
     inside = {}
     for share in (0.0, 0.2):
-        given = settings(iterations=120, start="ball", gaussians=800, max_gaussians=800, least_shown=share)
+        given = settings(iterations=300, start="ball", gaussians=800, max_gaussians=800, least_shown=share)
         found = fit(capture, **given, workspace=Workspace(tmp_path / str(share)))
         far = np.linalg.norm(found.points[0] - centre[0], axis=1)
         inside[share] = (far < 0.3).sum(), len(far)

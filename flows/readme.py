@@ -32,6 +32,7 @@ GARMENTS = {
     "Part kernel (kernel regression by part, as PartMM+)": "part_kernel",
     "Bone kernel (kernel regression by bone, settings by left-out clips)": "bone_kernel",
     "Bone response (linear filter by bone)": "bone_response",
+    "Part kernel + cloth (simulated where the kernel does not know)": "part_cloth",
 }
 MATCHED = {"FullMM": "fullmm", "PartMM": "partmm", "PartMM+": "partmm_plus", "Part kernel": "part_kernel"}
 ANIMALS = {"LBS": "robust_lbs", "BBW": "bbw", "MLP": "mlp", "GRU": "gru", **MATCHED}
@@ -108,6 +109,8 @@ def _garments(rows: pd.DataFrame) -> Grid:
     head = ["RMSE [mm]", "T-shirt, ours", "VTO, paper", "dress, ours", "VTO, paper"]
     found = [head]
     for label, m in GARMENTS.items():
+        if not (rows["method"] == m).any():
+            continue
         shirt, dress = ((ours(m, f"garments_{subject}"), theirs(m, subject)) for subject in ("tshirt", "dress"))
         found.append([label, *shirt, *dress])
     return found

@@ -49,18 +49,18 @@ def fit(
     more: a second x and y of the same frames, such as their mirror image; with ``tune`` left aside where
     clips that are left out together with their own image are predicted better without it.
     """
-    chosen = _landmarks(len(x), landmarks)
+    chosen = landmarks_of(len(x), landmarks)
     apart = squared_distances(x[chosen], x[chosen])
     unit = float(np.median(apart[apart > 0])) if (apart > 0).any() else 1.0
     centred, several = True, len(np.unique(clip)) > 1
     if tune and several:
-        width, ridge, centred = _best(apart / unit, y[chosen], clip[chosen], width, ridge)
+        width, ridge, centred = best_settings(apart / unit, y[chosen], clip[chosen], width, ridge)
     scale = np.sqrt(unit) * width
     if more is not None:
         both = tuple(np.concatenate(pair) for pair in zip((x, y), more, strict=True))
         if not (tune and several) or _gains(x, y, *both, clip, scale, ridge, centred, landmarks):
             x, y = both
-            chosen = _landmarks(len(x), landmarks)
+            chosen = landmarks_of(len(x), landmarks)
     centres = x[chosen]
     mean = y.mean(0) if centred else np.zeros(y.shape[1])
     left, right = correlation(centres, centres, scale), y - mean
@@ -118,7 +118,13 @@ def left_out(inverse: np.ndarray, y: np.ndarray, clip: np.ndarray, *, centred: b
     return errors
 
 
-def _best(apart: np.ndarray, y: np.ndarray, clip: np.ndarray, width: float, ridge: float) -> tuple[float, float, bool]:
+def best_settings(
+    apart: np.ndarray, y: np.ndarray, clip: np.ndarray, width: float, ridge: float
+) -> tuple[float, float, bool]:
+    """Width, ridge and whether y is centred: of multiples of those given, what predicts left-out clips best.
+
+    apart: (F, F) squared distances in units of their median.
+    """
     best = (np.inf, width, ridge, True)
     for w, r in product(WIDTHS, RIDGES):
         gram = matern(apart / (width * w) ** 2) + ridge * r * np.eye(len(apart))
@@ -129,13 +135,14 @@ def _best(apart: np.ndarray, y: np.ndarray, clip: np.ndarray, width: float, ridg
     return best[1:]
 
 
-def _landmarks(count: int, most: int) -> np.ndarray:
+def landmarks_of(count: int, most: int) -> np.ndarray:
+    """At most so many of ``count`` frames, evenly taken."""
     return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int))
 
 
 def _gains(x, y, x_both, y_both, clip, scale, ridge, centred, landmarks) -> bool:
     """Whether left-out clips are predicted better with the second half of x_both and y_both than with x and y alone."""
-    some = _landmarks(len(x), landmarks // 2)
+    some = landmarks_of(len(x), landmarks // 2)
     errors = []
     for a, b, rows in ((x, y, some), (x_both, y_both, np.concatenate([some, len(x) + some]))):
         gram = matern(squared_distances(a[rows], a[rows]) / scale**2) + ridge * np.eye(len(rows))

@@ -40,6 +40,25 @@ def test_no_unseen_frame_reaches_gaussians_bones_skeleton_or_database():
     assert ("scene", "views") not in behind(case.nodes["reconstruction"][0])
 
 
+@pytest.mark.parametrize("experiment", ["quick", "table3_garments", "table4"])
+def test_what_a_method_learns_from_is_made_of_training_frames_alone(experiment):
+    """The unseen frames are seen in the query alone, and there through poses; only bounds fit them."""
+    cases = planned([f"+experiment={experiment}"])
+    judged = {name: case.nodes["animation"][0] for name, case in cases.items() if "animation" in case.nodes}
+    assert len(judged) >= 5
+    for name, node in judged.items():
+        if name == "compression_floor":
+            continue
+        assert set(node.inputs) == {"training", "query"}
+        for part, (upstream, output) in node.inputs["training"].items():
+            made = behind(upstream) | {(upstream.stage, output)}
+            assert ("split", "test") not in made, (name, part)
+            assert ("anchors", "test") not in made, (name, part)
+        assert node.inputs["query"][0].stage == "poses"
+        for rig in ("skinning", "skeleton", "clusters", "canonical"):
+            assert ("split", "test") not in behind(cases[name].nodes[rig][0])
+
+
 def test_all_methods_are_judged_on_the_same_views():
     cases = planned(TABLE4)
     seen = {(node.id, output) for node, output in (case.nodes["seen"] for case in cases.values())}

@@ -113,3 +113,16 @@ def test_a_lopsided_character_has_no_image(symmetric):
     one_armed = skeleton.parents.copy()
     one_armed[planted.NAMES.index("arm_l")] = planted.NAMES.index("spine")
     assert mirrored(replace(symmetric, skeleton=replace(skeleton, parents=one_armed))) is None
+
+
+def test_a_point_that_has_a_twin_takes_it_alone_however_near_others_lie(symmetric):
+    """Neighbouring points follow two bones by turns: their image does, too."""
+    skeleton = symmetric.skeleton
+    joint, place = np.divmod(np.arange(len(symmetric.skinning.rest)), 27)
+    owner = np.where(place % 2, joint, np.maximum(skeleton.parents[joint], 0))
+    weights = np.eye(len(skeleton.parents), dtype=np.float32)[owner]
+    mixed = replace(symmetric, skinning=replace(symmetric.skinning, weights=weights))
+    _, bones = mirrored(mixed)
+    flip = np.diag([-1.0, 1.0, 1.0, 1.0]).astype(np.float32)
+    used = np.unique(owner)
+    np.testing.assert_allclose(bones[:, used], (FLIP @ symmetric.database.bones[:, PAIRS] @ flip)[:, used], atol=2e-4)

@@ -78,9 +78,17 @@ def plan_pictures(planned: list[Planned], graph: Graph) -> list[Node]:
         cases = [p for p in cases if p.nodes.get("test") == truth]
         first = [p for p in cases if p.case.variant == cases[0].case.variant]
         shown = first if len(first) > 1 else cases
-        shown = shown if len(shown) <= PANELS else [shown[0], *shown[1 - PANELS :]]
-        found += _pictures(shown, graph)
+        found += _pictures(_side_by_side(shown), graph)
     return found
+
+
+def _side_by_side(cases: list[Planned]) -> list[Planned]:
+    """The few that a picture has room for, in their order: the last, those of ``IN_VIDEOS``, the first, the latest."""
+    methods = {p.case.method: p for p in reversed(cases)}
+    known = [next(methods[m] for m in names if m in methods) for names in IN_VIDEOS if {*names} & {*methods}]
+    wanted = [cases[-1], *known, cases[0], *reversed(cases)]
+    chosen = list({id(p): p for p in wanted})[:PANELS]
+    return [p for p in cases if id(p) in chosen]
 
 
 def _views_pictures(planned: list[Planned], graph: Graph) -> list[Node]:
@@ -99,9 +107,9 @@ def _views_pictures(planned: list[Planned], graph: Graph) -> list[Node]:
 
 
 def plan_videos(planned: list[Planned], graph: Graph) -> list[Node]:
-    """For every dataset, truth and the methods of ``IN_VIDEOS`` in an unseen clip; where fewer than two of them were
-    run, none."""
-    found = []
+    """For every dataset, truth and the methods of ``IN_VIDEOS`` in an unseen clip, where two of them or more were run;
+    a character that a file drives."""
+    found = [_driven_video(p, graph) for p in planned if "driven_animation" in p.nodes]
     planned = [p for p in planned if "animation" in p.nodes and p.case.variant == NO_ABLATION]
     for data in dict.fromkeys(p.case.data for p in planned):
         methods = {p.case.method: p for p in reversed(planned) if p.case.data == data}  # of several seeds, the first
@@ -114,6 +122,13 @@ def plan_videos(planned: list[Planned], graph: Graph) -> list[Node]:
         function, settings = "tasks.drawing.pictures:clip_picture", {"focus": list(animations)[-1]}
         found.append(graph.add("video", function, settings, outputs=("picture",), case=data, **inputs))
     return found
+
+
+def _driven_video(planned: Planned, graph: Graph) -> Node:
+    inputs = {"motion": planned.nodes["driven_motion"], "animation": planned.nodes["driven_animation"]}
+    inputs["canonical"] = planned.nodes["canonical"]
+    function = "tasks.drawing.pictures:driven_clip"
+    return graph.add("video", function, {}, outputs=("picture",), case=planned.case.data, **inputs)
 
 
 def _labels(cases: list[Planned]) -> list[str]:

@@ -16,8 +16,6 @@ def confidence_picture(confidence: Confidence, animations: dict[str, Animation],
     lines = {"expected": confidence.expected} if confidence.expected.any() else {}
     lines |= {label: frame_rmse(animation.points, test.points) for label, animation in animations.items()}
     series = [plot.Series(name, frames, factor * np.asarray(y, float)) for name, y in lines.items()]
-    clips = ", ".join(f"{name} from {clip.start}" for name, clip in zip(test.clip_names, test.clips(), strict=True))
-    drawing = plot.lines(series, x="unseen frame", y=f"RMSE [{unit}]")
-    return Picture(
-        "confidence", f"{test.name}: error expected from the distance to the database ({clips})", None, drawing
-    )
+    clips = [(float(clip.start), name) for name, clip in zip(test.clip_names, test.clips(), strict=True)]
+    drawing = plot.lines(series, x="unseen frame", y=f"RMSE [{unit}]", marks=clips)
+    return Picture("confidence", f"{test.name}: error expected from the distance to the database", None, drawing)

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from tasks.drawing import plot, render
 from tasks.drawing.colours import CLAY, bone_colours, error_map, part_colours, weight_map
 from tasks.evaluation.metrics import frame_rmse, squared_errors, unit_of
-from tasks.geometry import measure
+from tasks.geometry import kinematics, measure
 from tasks.values import Canonical, Clusters, Motion, Parts, Skeleton, Skinning
 
 PICTURE = 330  # side of a square picture in a figure, in pixels; others have its area
@@ -48,10 +48,19 @@ def shape_of(points: np.ndarray, faces: np.ndarray | None) -> Shape:
 
 
 def azimuth_of(motion: Motion) -> float:
-    """Where all pictures of a subject are taken from: its broad side, and the front where it travels. In radians."""
+    """Where all pictures of a subject are taken from: its broad side, and the front where it travels. In radians.
+
+    What is as broad one way as the other, such as a dress, is seen from the broad side of the skeleton in it.
+    """
     first = motion.clips()[0]
     start = motion.points[first.start]
-    azimuth = render.broadside(start)
+    rig = motion.rig
+    if rig is None or render.longish(start):
+        azimuth = render.broadside(start)
+    else:
+        pose = slice(first.start, first.start + 1)
+        posed = kinematics.forward(rig.parents, rig.joints, rig.rotations[pose], rig.translations[pose])
+        azimuth = render.broadside(kinematics.joint_positions(posed, rig.joints)[0])
     travel = motion.points[first.stop - 1].mean(0) - start.mean(0)
     towards_eye = travel[0] * np.sin(azimuth) + travel[2] * np.cos(azimuth)
     away = towards_eye < 0 and np.hypot(travel[0], travel[2]) > 0.2 * measure.diagonal(start)
@@ -91,7 +100,7 @@ def error_figure(
             row.append(panel(shape, cameras[i], points[frame], error_map(errors[name][i] / top), lines, theme))
         rows.append(np.hstack(row))
     sheet = np.vstack(rows)
-    return render.finish(_row([sheet, _bar(len(sheet), error_map, top, unit, theme)], theme))
+    return render.finish(beside([sheet, colour_bar(len(sheet), error_map, top, unit, theme)], theme))
 
 
 def skeleton_figure(
@@ -106,14 +115,15 @@ def skeleton_figure(
         render.paint_skeleton(canvas, camera, skeleton.joints, skeleton.parents, colours, size=9, theme=theme)
 
     points = canonical.points
-    sides = [_cameras(points[None], azimuth + turn)[0] for turn in (0.0, 0.5 * np.pi)]
+    seen = np.concatenate([points, skeleton.joints])  # hands stand out of a dress
+    sides = [_cameras(seen[None], azimuth + turn)[0] for turn in (0.0, 0.5 * np.pi)]
     glass = {"opacity": 0.16, "rim": 0.5}
     pictures = [panel(shape, side, points, CLAY * 0.9, lines, theme, joints, **glass) for side in sides]
     if parts is None:
-        return render.finish(_row(pictures, theme))
+        return render.finish(beside(pictures, theme))
     names = [f"{len(skeleton.parents)} joints", *parts.names]
     legend = _legend(max(map(len, pictures)), names, [None, *part_colours(len(parts.names))], theme)
-    return render.finish(_row([*pictures, legend], theme))
+    return render.finish(beside([*pictures, legend], theme))
 
 
 def parts_figure(
@@ -146,15 +156,15 @@ def bones_figure(canonical: Canonical, skinning: Skinning, *, azimuth: float, th
         panel(shape, back, points, mixed, ["the other side"], theme),
         panel(shape, front, points, weight_map((shared - 1) / 3), ["bones that share a point"], theme),
     ]
-    bar = _bar(len(pictures[0]), weight_map, 4.0, "bones", theme, low=1.0)
-    return render.finish(_row([*pictures, bar], theme))
+    pictures.append(colour_bar(len(pictures[0]), weight_map, 4.0, "bones", theme, low=1.0))
+    return render.finish(beside(pictures, theme))
 
 
 def count_figure(clusters: Clusters, diagonal: float) -> str:
     """Error of rigid clusters against their number, with the chosen number marked. -> SVG."""
     chosen = int(clusters.transforms.shape[1])
     series = [plot.Series("rigid clusters", clusters.curve_count, 100.0 * clusters.curve_error / diagonal)]
-    return plot.lines(series, x="clusters", y="vertex RMSE [% of diagonal]", mark=(chosen, f"chosen: {chosen}"))
+    return plot.lines(series, x="clusters", y="vertex RMSE [% of diagonal]", marks=[(chosen, f"chosen: {chosen}")])
 
 
 def worn_figure(
@@ -251,7 +261,7 @@ def grid(pictures: list[np.ndarray], columns: int, theme: str) -> np.ndarray:
     return np.vstack([np.hstack(every[i : i + columns]) for i in range(0, len(every), columns)])
 
 
-def _row(pictures: list[np.ndarray], theme: str) -> np.ndarray:
+def beside(pictures: list[np.ndarray], theme: str) -> np.ndarray:
     """Pictures side by side; those of less height get paper above and below."""
     tallest = max(len(p) for p in pictures)
     out = []
@@ -264,7 +274,7 @@ def _row(pictures: list[np.ndarray], theme: str) -> np.ndarray:
     return np.hstack(out)
 
 
-def _bar(height: int, colour: Callable, top: float, unit: str, theme: str, low: float = 0.0) -> np.ndarray:
+def colour_bar(height: int, colour: Callable, top: float, unit: str, theme: str, low: float = 0.0) -> np.ndarray:
     """A colour bar for a sheet of ``height`` canvas pixels, from low to top in the unit."""
     height //= render.SUPERSAMPLE
     tall = min(320, height - 60)

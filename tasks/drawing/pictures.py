@@ -89,5 +89,11 @@ def driven_picture(canonical: Canonical, motion: Motion, animation: Animation) -
     return Picture("driven", f"driven by {motion.name}, at even steps", _png(pixels))
 
 
+def driven_clip(canonical: Canonical, motion: Motion, animation: Animation) -> Picture:
+    """The same as a looping video."""
+    data = video.driven_video(animation.points, canonical.faces, motion.fps, azimuth=0.5)
+    return Picture("driven_video", f"driven by {motion.name}, its beginning", webp=np.frombuffer(data, np.uint8))
+
+
 def _png(pixels: np.ndarray) -> np.ndarray:
     return np.frombuffer(render.png(pixels), np.uint8)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
@@ -76,19 +77,15 @@ def lines(
     y: str,
     log_x: bool = False,
     log_y: bool = False,
-    mark: tuple[float, str] | None = None,
+    marks: Sequence[tuple[float, str]] = (),
 ) -> str:
     """A chart of lines with points and bands. x, y: the axes' labels with units; log_x, log_y: logarithmic axes, which
-    need positive values; mark: (value, words) of an upright dashed line. -> the text of an SVG."""
+    need positive values; marks: (value, words) of upright dashed lines. -> the text of an SVG."""
     xs, ys = (np.concatenate([np.asarray(v, float) for v in vs]) for vs in (_all_x(series), _all_y(series)))
     across = _axis(xs, LEFT, WIDTH - RIGHT, log_x, from_zero=False)
     up = _axis(ys, HEIGHT - BOTTOM, TOP, log_y, from_zero=True)
     parts = [*_frame(across, up, x, y)]
-    if mark:
-        at = across(mark[0])
-        anchor, shift = ("end", -6) if at > (LEFT + WIDTH) / 2 else ("start", 6)
-        parts.append(f'<line class="mark" x1="{at:.1f}" x2="{at:.1f}" y1="{TOP}" y2="{HEIGHT - BOTTOM}"/>')
-        parts.append(f'<text x="{at + shift:.1f}" y="{TOP + 12}" text-anchor="{anchor}">{escape(mark[1])}</text>')
+    parts += _marks([(across(value), words) for value, words in marks])
     for i, one in enumerate(series):
         parts += _line(one, across, up, *_look(i))
     width = WIDTH
@@ -96,6 +93,22 @@ def lines(
         parts += _names(series)
         width += 44 + int(7.2 * max(len(one.name) for one in series))
     return _svg(parts, HEIGHT, f"{y} against {x}", width)
+
+
+def _marks(marks: list[tuple[float, str]]) -> list[str]:
+    """Upright lines at these pixels with words beside them, a line lower where they would meet those before."""
+    parts, free, level = [], 0.0, 0
+    for at, words in marks:
+        wide = 8 * len(words) + 6
+        left = at + wide > WIDTH - RIGHT
+        start = at - wide if left else at
+        level = level + 1 if start < free else 0
+        free = start + wide
+        anchor, shift = ("end", -6) if left else ("start", 6)
+        parts.append(f'<line class="mark" x1="{at:.1f}" x2="{at:.1f}" y1="{TOP}" y2="{HEIGHT - BOTTOM}"/>')
+        y = TOP + 12 + 16 * level
+        parts.append(f'<text x="{at + shift:.1f}" y="{y}" text-anchor="{anchor}">{escape(words)}</text>')
+    return parts
 
 
 def dots(rows: list[str], series: list[Series], *, x: str, zero: str = "") -> str:

@@ -82,6 +82,12 @@ def look(
     return replace(camera, scale=float((room / reach).min()))
 
 
+def longish(points: np.ndarray) -> bool:
+    """Whether a shape is half as long again as broad, seen from above. points: (N, 3), +Y up."""
+    spread = np.linalg.eigvalsh(np.cov(np.asarray(points, np.float64)[:, [0, 2]].T))
+    return bool(spread[1] > 1.5**2 * spread[0])
+
+
 def broadside(points: np.ndarray, turn: float = 0.55) -> float:
     """The azimuth that sees a shape at its widest, turned by ``turn`` radians for depth. points: (N, 3), +Y up."""
     ground = np.asarray(points, np.float64)[:, [0, 2]]

@@ -1,4 +1,4 @@
-"""A test clip as a small looping video, truth and methods side by side: an animated WebP, which browsers just play."""
+"""Small looping videos, of a test clip with truth and methods side by side: animated WebP, which browsers just play."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from tasks.evaluation.metrics import frame_rmse, squared_errors, unit_of
 from tasks.values import Motion
 
 SIDE = 250  # pixels of a panel
+DRIVEN = 420  # of one that stands alone
 RATE = 12.5  # frames a second at most
 LONGEST = 64  # frames
 LARGEST = 1_400_000  # bytes
@@ -33,7 +34,7 @@ def clip_video(
     truth = test.points[frames]
     unit, factor = unit_of("length", test.unit)
     if unit == "unit":  # says nothing by itself
-        unit, factor = "% of the diagonal", 100.0 / diagonal
+        unit, factor = "% of diagonal", 100.0 / diagonal
     errors = {name: factor * np.sqrt(squared_errors(points[frames], truth)) for name, points in results.items()}
     top = plot.round_up(float(np.quantile(np.stack(list(errors.values())), 0.99)), (1, 1.5, 2, 3, 4, 5, 6, 8, 10))
     shape = figures.shape_of(truth[0], test.faces)
@@ -42,15 +43,29 @@ def clip_video(
 
     def picture(i: int) -> np.ndarray:
         at = camera.at(camera.centre + centres[i])
-        panels = [figures.panel(shape, at, truth[i], CLAY, ["truth"], "light")]
+        panels = [figures.panel(shape, at, truth[i], CLAY, [f"truth, {test.clip_names[clip]}"], "light")]
         for name, points in results.items():
             panels.append(
                 figures.panel(shape, at, points[frames[i]], error_map(errors[name][i] / top), [name], "light")
             )
-        return render.finish(figures.grid(panels, 2 if len(panels) == 4 else 3, "light"))
+        sheet = figures.grid(panels, 2 if len(panels) == 4 else 3, "light")
+        scale = figures.colour_bar(len(sheet), error_map, top, unit, "light")
+        return render.finish(figures.beside([sheet, scale], "light"))
 
     caption = f"{test.name}, unseen clip {test.clip_names[clip]}: darker is further off, up to {top:g} {unit}"
     return animated([picture(i) for i in range(len(frames))], seconds), caption
+
+
+def driven_video(points: np.ndarray, faces: np.ndarray | None, fps: float, *, azimuth: float) -> bytes:
+    """A shape in motion, the eye going along. points: (F, N, 3); faces: (T, 3) or None. -> the WebP file."""
+    step = max(1, math.ceil(fps / RATE - 1e-9))
+    shown = points[::step][:LONGEST]
+    shape = figures.shape_of(shown[0], faces)
+    centres = shown.mean(1, dtype=np.float64)
+    camera = _camera(shown - centres[:, None], azimuth, DRIVEN)
+    views = [camera.at(camera.centre + centre) for centre in centres]
+    pictures = [figures.panel(shape, v, p, CLAY, [], "light") for v, p in zip(views, shown, strict=True)]
+    return animated([render.finish(picture) for picture in pictures], step / fps)
 
 
 def animated(pictures: list[np.ndarray], seconds: float) -> bytes:
@@ -83,7 +98,7 @@ def _frames(test: Motion, clip: int) -> tuple[np.ndarray, float]:
     return np.arange(there.start, there.stop, step)[:LONGEST], step / test.fps
 
 
-def _camera(points: np.ndarray, azimuth: float) -> render.Camera:
+def _camera(points: np.ndarray, azimuth: float, side: int = SIDE) -> render.Camera:
     """A camera that holds all frames (F, N, 3), each moved to its own centre."""
-    size = {"width": SIDE, "height": SIDE, "distance": figures.EYE, "margin": 0.02}
+    size = {"width": side, "height": side, "distance": figures.EYE, "margin": 0.02}
     return render.look(points.reshape(-1, 3), azimuth=azimuth, elevation=figures.ELEVATION, **size)

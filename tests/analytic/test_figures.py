@@ -186,7 +186,7 @@ def points_of(svg: str, tag: str) -> list:
 def test_a_chart_puts_points_where_they_belong():
     one = plot.Series("a < b", np.array([10, 20, 30]), np.array([4.0, 0.0, 2.0]))
     two = plot.Series("c", np.array([30, 10]), np.array([1.0, 3.0]), np.array([0.5, 0.5]))
-    svg = plot.lines([one, two], x="count", y="error [%]", mark=(20, "chosen: 20"))
+    svg = plot.lines([one, two], x="count", y="error [%]", marks=[(20, "chosen: 20")])
     dots = np.array([[float(e["cx"]), float(e["cy"])] for e in points_of(svg, "circle")])
     assert np.allclose(np.diff(dots[:3, 0]), dots[1, 0] - dots[0, 0])
     assert dots[2, 1] == pytest.approx((dots[0, 1] + dots[1, 1]) / 2, abs=0.11)  # 2 lies midway between 4 and 0

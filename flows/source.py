@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import re
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Literal
@@ -138,9 +139,11 @@ def choices(folders: tuple[str, ...], function: str, what: str, name: str) -> st
             if _defines(f"tasks.{folder}.{path.stem}", function):
                 known.setdefault(path.stem, folder)
     if name not in known:
-        raise InputError(what, expected=f"one of {', '.join(sorted(known))}", found=repr(name))
+        there = [f"tasks/{f}/{name}.py" for f in folders if has(f"tasks.{f}.{name}")] if name.isidentifier() else []
+        found = f"{there[0]} without a function {function}" if there else repr(name)
+        raise InputError(what, expected=f"one of {', '.join(sorted(known))}", found=found)
     return f"tasks.{known[name]}.{name}:{function}"
 
 
 def _defines(module: str, function: str) -> bool:
-    return f"\ndef {function}(" in _source(module)
+    return re.search(rf"^def {function}\(", _source(module), re.MULTILINE) is not None

@@ -104,6 +104,10 @@ def compose(overrides: tuple[str, ...]) -> DictConfig:
             return OmegaConf.unsafe_merge(compose(tuple(rest)).copy(), *map(OmegaConf.load, files))
         return _by_hydra(overrides)
     except (HydraException, OmegaConfBaseException) as error:
+        absent = re.match(r"Could not override '(\w+)'", str(error))
+        if absent and absent[1] in known:
+            do = "scene and views come with reconstruction=cpu, other groups with a dataset or method that has them"
+            raise InputError(absent[1], expected="a group of this config", found="none of this name", do=do) from None
         raise InputError("config", expected="a config that composes", found=_first_line(error)) from None
 
 

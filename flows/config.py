@@ -126,7 +126,8 @@ def _sweep(
     choices = {o.key_or_group: str(o.value()) for o in overrides if o.key_or_group in groups()}
     values = [o for o in overrides if o.key_or_group not in choices]
     used |= {o.input_line for o in overrides if o.key_or_group in choices}
-    base, set_here = set_values(compose(_group_overrides(choices)), values)
+    experiment = {group: choice for group, choice in choices.items() if group == "experiment"}  # it alone has a grid
+    base, set_here = set_values(compose(_group_overrides(experiment)), values)
     used |= {text for text in set_here if text.startswith("sweep.")}
     sweep = schema.check(plain(base)["sweep"], SWEEP, "sweep.")
     unnamed = ("seed", "method_seed", "dataset", "dataset.path", "method")  # have columns of their own

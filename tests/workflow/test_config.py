@@ -97,6 +97,7 @@ def one_line(error: InputError) -> str:
         (["seed=x"], ["seed", "a whole number"]),
         (["split.test=3"], ["split.test", "a list"]),
         (["report.name=${nothing}"], ["nothing"]),
+        (["scene=multiview"], ["scene", "a group of this config", "reconstruction=cpu"]),
         (["bones.prune=0.3"], ["bones.prune", "below 1 / influences", "0.3 with influences=4"]),
         (["animate.shrink=true"], ["animate.shrink", "represent=residual", "True with represent=root"]),
         (["method=partmm_plus", "animate.shrink=true"], ["animate.shrink", "false with sources", "sources=100"]),
@@ -159,6 +160,11 @@ def test_a_setting_of_another_type_names_function_and_setting(tmp_path, monkeypa
             source.signature("tasks.methods.mine:animate")
     source._source.cache_clear()
     source._tree.cache_clear()
+
+
+def test_the_experiments_datasets_may_bring_a_group_that_is_chosen():
+    cases = config.expand(["+experiment=make_scenes", "scene=multiview", "sweep.datasets=[scene_figure]"])
+    assert [c.config["scene"]["layout"] for c in cases] == ["multiview"]
 
 
 def test_seeds_are_not_variants():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tempfile
-from concurrent.futures import BrokenExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,7 +10,7 @@ from flows.cache import CorruptArtefact, Ref, Store
 from flows.costs import Past, chains
 from flows.graph import Graph, Node, short
 from flows.progress import Progress
-from flows.runners import WorkerLost, in_flight
+from flows.runners import WorkerLost, in_flight, of_a_lost_worker
 from flows.server import watched
 from flows.stage import Job, key_of, run
 from flows.stopping import stoppable
@@ -57,8 +56,10 @@ def _pass(graph: Graph, config: dict, progress: Progress, outcome: Outcome) -> N
         progress.follow(events)
         try:
             _hand_out(waiting, config, events, progress, outcome)
-        except BrokenExecutor as error:
-            raise WorkerLost(progress.running()) from error
+        except Exception as error:
+            if of_a_lost_worker(error):
+                raise WorkerLost(progress.running()) from error
+            raise
 
 
 def _hand_out(waiting: list[Node], config: dict, events: str, progress: Progress, outcome: Outcome) -> None:

@@ -5,8 +5,14 @@ from __future__ import annotations
 import importlib
 import os
 import sys
+from concurrent.futures import BrokenExecutor
 
 from tasks.errors import InputError
+
+CLUSTERS_SAY = {
+    "distributed.KilledWorker",
+    *(f"ray.{name}" for name in ("WorkerCrashedError", "LocalRayletDiedError", "NodeDiedError", "OutOfMemoryError")),
+}
 
 
 class WorkerLost(Exception):
@@ -19,6 +25,13 @@ class WorkerLost(Exception):
             f"{'; '.join(stages) or 'none'}; what is finished is kept: the same command goes on from there, with "
             "runner.workers=1 in less memory"
         )
+
+
+def of_a_lost_worker(error: Exception) -> bool:
+    """Whether an error says that a worker died: of a pool of processes, or what Dask and Ray raise when they have
+    given a stage to new workers in vain. Their packages need not be there."""
+    names = {f"{kind.__module__.split('.')[0]}.{kind.__name__}" for kind in type(error).__mro__}
+    return isinstance(error, BrokenExecutor) or bool(names & CLUSTERS_SAY)
 
 
 def task_runner(settings: dict):

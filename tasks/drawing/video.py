@@ -18,7 +18,7 @@ DRIVEN = 420  # of one that stands alone
 RATE = 12.5  # frames a second at most
 LONGEST = 64  # frames
 LARGEST = 1_400_000  # bytes
-QUALITIES = (70, 50, 35, 20)  # of WebP, the first that stays below LARGEST
+QUALITIES = (85, 70, 50, 35, 20)  # of WebP, the first that stays below LARGEST
 
 
 def clip_video(

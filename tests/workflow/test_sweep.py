@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import fields
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,7 +16,7 @@ from flows.cache import CorruptArtefact, Store
 from flows.engine import compute
 from flows.graph import Graph, digest_of_files, short
 from flows.progress import Progress
-from flows.runners import WorkerLost, task_runner
+from flows.runners import WorkerLost, of_a_lost_worker, task_runner
 from flows.stage import Job, key_of, run
 from flows.sweep import StageFailed, check_place, raise_first
 from tasks.errors import InputError
@@ -122,6 +123,16 @@ def test_a_killed_worker_is_named_and_the_next_run_goes_on(tmp_path, prefect_ser
     (tmp_path / "log.txt").write_text("fatal\n")
     assert world.run(world.graph(3.0, tail="fatal")).computed
     assert world.bodies() == ["fatal", "fatal"]
+
+
+def test_what_dask_and_ray_say_of_a_lost_worker_is_understood():
+    killed = type("KilledWorker", (Exception,), {"__module__": "distributed.scheduler"})
+    raylet = type("LocalRayletDiedError", (Exception,), {"__module__": "ray.exceptions"})
+    assert of_a_lost_worker(killed("x"))
+    assert of_a_lost_worker(type("More", (raylet,), {})())
+    assert of_a_lost_worker(BrokenProcessPool())
+    assert not of_a_lost_worker(type("KilledWorker", (Exception,), {})())
+    assert not of_a_lost_worker(ValueError("a defect of ours"))
 
 
 def test_changed_setting_re_runs_only_what_follows(world):

@@ -5,7 +5,6 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Annotated, Literal
 
-from tasks.errors import InputError
 from tasks.values import Capture, Reconstruction
 from tasks.workspace import Workspace
 
@@ -14,7 +13,10 @@ def fit(
     capture: Capture,
     *,
     deformation: Literal["nodes", "mlp"],
-    backend: Literal["numba", "gsplat", "reference"],
+    backend: Annotated[
+        Literal["numba", "gsplat", "reference"],
+        "backend != 'gsplat' or deformation == 'mlp': numba with deformation=nodes",
+    ],
     iterations: Annotated[int, "[1, inf)"],
     largest: Annotated[int, "[1, inf)"],
     start: Literal["hull", "ball"],
@@ -23,11 +25,11 @@ def fit(
     hull_agree: Annotated[float, "[0, 1]"],
     hull_cells: Annotated[int, "[1, inf)"],
     static: Annotated[float, "[0, 1]"],
-    grown: Annotated[float, "[0, 1]"],
+    grown: Annotated[float, "[0, 1]", "grown >= static: at least static"],
     coarsest: Annotated[float, "(0, 1]"],
     full: Annotated[float, "[0, 1]"],
     gaussians: Annotated[int, "[1, inf)"],
-    max_gaussians: Annotated[int, "[1, inf)"],
+    max_gaussians: Annotated[int, "[1, inf)", "max_gaussians >= gaussians: at least gaussians"],
     growth: Annotated[float, "[0, inf)"],
     divide_every: Annotated[int, "[1, inf)"],
     divide_until: Annotated[float, "[0, 1]"],
@@ -47,7 +49,7 @@ def fit(
     depth: Annotated[int, "[1, inf)"],
     width: Annotated[int, "[1, inf)"],
     skip: Annotated[int, "[0, inf)"],
-    deltas: bool,
+    deltas: Annotated[bool, "not deltas or deformation == 'mlp': false with deformation=nodes"],
     rate_means: Annotated[float, "(0, inf)"],
     rate_scales: Annotated[float, "(0, inf)"],
     rate_opacities: Annotated[float, "(0, inf)"],
@@ -82,24 +84,10 @@ def fit(
     averaged: the share of the last iterations of which the mean is the result.
 
     Checkpoints lie in the workspace every minute; a fit that is run again goes on from there and ends with the same
-    bits. Raises InputError for a capture that cannot be fitted, for settings that make no sense, for a loss that is not
+    bits. Raises InputError for a capture that cannot be fitted, for a loss that is not
     finite (with the term and the iteration), and when the memory's cap is passed.
     """
     recipe = {k: v for k, v in locals().items() if k not in ("capture", "workspace")}
-    _check(recipe)
     from tasks.reconstruction.fitting import run
 
     return run(capture, SimpleNamespace(**recipe), workspace)
-
-
-def _check(recipe: dict) -> None:
-    """Raises InputError for the first setting that makes no sense beside another."""
-    rules = [
-        ("max_gaussians", recipe["max_gaussians"] >= recipe["gaussians"], f"at least {recipe['gaussians']}"),
-        ("grown", recipe["grown"] >= recipe["static"], f"at least static, {recipe['static']}"),
-        ("backend", recipe["backend"] != "gsplat" or recipe["deformation"] == "mlp", "numba with deformation=nodes"),
-        ("deltas", not (recipe["deltas"] and recipe["deformation"] == "nodes"), "false with deformation=nodes"),
-    ]
-    for name, good, expected in rules:
-        if not good:
-            raise InputError(f"reconstruction.{name}", expected=expected, found=str(recipe[name]))

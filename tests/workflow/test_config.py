@@ -16,6 +16,7 @@ from tasks.errors import InputError
 
 GROUPS = compose.groups()
 FILE = ["dataset=mesh_sequence", "dataset.path=some.npz"]
+FITTED = ["dataset=scene_figure", "method=gaussians"]
 OF_A_FIT = ("scene", "views")  # groups that only a fit has
 NEEDS_PATH = ("mesh_sequence", "rigged_character", "vto", "anime", "dnerf", "multiview")
 
@@ -98,6 +99,10 @@ def one_line(error: InputError) -> str:
         (["split.test=3"], ["split.test", "a list"]),
         (["report.name=${nothing}"], ["nothing"]),
         (["scene=multiview"], ["scene", "a group of this config", "reconstruction=cpu"]),
+        ([*FITTED, "reconstruction.max_gaussians=10"], ["reconstruction.max_gaussians", "with gaussians=5000"]),
+        ([*FITTED, "reconstruction.grown=0.01"], ["reconstruction.grown", "at least static", "0.01 with static=0.04"]),
+        ([*FITTED, "reconstruction.backend=gsplat"], ["reconstruction.backend", "numba with deformation=nodes"]),
+        ([*FITTED, "reconstruction.deltas=true"], ["reconstruction.deltas", "false with deformation=nodes"]),
         (["bones.prune=0.3"], ["bones.prune", "below 1 / influences", "0.3 with influences=4"]),
         (["animate.shrink=true"], ["animate.shrink", "represent=residual", "True with represent=root"]),
         (["method=partmm_plus", "animate.shrink=true"], ["animate.shrink", "false with sources", "sources=100"]),

@@ -6,13 +6,18 @@ import numpy as np
 import pytest
 
 from tasks.geometry import rigid
-from tasks.geometry.rotations import from_rotation_vector
-from tasks.motion import kernel
+from tasks.geometry.rotations import from_rotation_vector, to_quaternion
+from tasks.motion import affine, kernel
+from tasks.motion.blending import gather
 from tasks.motion.dynamics import root_dynamics
+from tasks.motion.matching import Way, prepare
+from tasks.motion.online import DELAY, Online, _delayed
 from tasks.motion.posed import DYNAMICS, Posed
 from tasks.motion.regression import bone_radii, features
+from tasks.motion.search import Keys, Matches
 from tasks.values import Poses
 from tests.analytic import planted
+from tests.analytic.test_methods import PAPER
 
 
 @pytest.mark.parametrize("fps", [30.0, 60.0, 1.0])
@@ -80,3 +85,46 @@ def test_images_are_learnt_from_only_where_left_out_clips_are_met_better(helps):
     if helps:
         asked = np.linspace(-2.5, 2.5, 9)[:, None]
         np.testing.assert_allclose(model(asked), np.concatenate([np.sin(asked), asked], axis=1), atol=0.1)
+
+
+def test_every_level_has_its_share_of_a_frame_however_many_windows_cover_it():
+    """Ten frames in windows of three: at the ends fewer windows cover a frame, on both levels."""
+    start = np.full((2, 8, 1), -1, np.int32)
+    start[0, :6, 0], start[1, :, 0] = np.arange(6), 100 + np.arange(8)
+    found = gather(
+        Matches(np.zeros((2, 8, 1), np.float32), start, np.array([6, 8])),
+        [2, 1],
+        patch=3,
+        lambda_=0.7,
+        temperature=1.0,
+    )
+    assert len(found.frame) == 10
+    for frame, share, count in zip(found.frame, found.share, found.count, strict=True):
+        coarse = frame[:count] < 100
+        assert share[:count][coarse].sum() == pytest.approx(0.3)
+        assert share[:count][~coarse].sum() == pytest.approx(0.7)
+
+
+def test_moments_are_apart_by_angles_and_dynamics_alike():
+    angle, push = 0.04, np.array([0.01, -0.03, 0.02])
+    turns = np.stack([from_rotation_vector(np.array([[a, 0.0, 0.0], [0.0, 0.0, 0.0]])) for a in (0.0, angle)])
+    keys = Keys(
+        to_quaternion(turns).astype(np.float32),
+        np.stack([np.zeros((1, 3)), push[None]]).astype(np.float32),
+        np.array([0, 1, 2]),
+    )
+    now = affine._now(keys, np.array([3.0, 1.0]))
+    apart = len(affine.LAGS) * ((now[0] - now[1]) ** 2).sum()
+    assert apart == pytest.approx(0.75 * angle**2 + push @ push, rel=1e-3)
+
+
+def test_a_stream_compares_dynamics_as_they_were_when_they_became_known():
+    clips = [planted.gesture(30, 1)]
+    train = planted.training(clips, affinity=0.0)
+    ready = prepare(train, Way(**PAPER | {"dynamics": 1.0, "levels": 1}))
+    stream, wanted = Online(ready), _delayed(ready.known.keys(0, 1.0)).extra
+    poses = train.database.poses
+    for frame in range(30):
+        stream.pose(poses.rotations[frame], poses.translations[frame])
+        if frame >= 2 * DELAY:
+            np.testing.assert_allclose(stream._keys[-1][1], wanted[frame], atol=1e-5)

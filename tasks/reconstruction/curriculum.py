@@ -44,7 +44,11 @@ class Schedule:
     def size(self, iteration: int) -> int:
         """Which of :meth:`sizes` an iteration uses; they change at even distances."""
         steps = len(self.sizes()) - 1
-        return min(steps, int(steps * iteration / max(self.full * self.iterations, 1e-9)))
+        return min(steps, int(steps * self.sharpness(iteration)))
+
+    def sharpness(self, iteration: int) -> float:
+        """How far along the way to images of the whole size an iteration is, 0 to 1."""
+        return min(1.0, iteration / max(self.full * self.iterations, 1e-9))
 
 
 class Window:

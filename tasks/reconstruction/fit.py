@@ -28,6 +28,7 @@ def fit(
     grown: Annotated[float, "[0, 1]", "grown >= static: at least static"],
     coarsest: Annotated[float, "(0, 1]"],
     full: Annotated[float, "[0, 1]"],
+    blur: Annotated[float, "[0, inf)"],
     gaussians: Annotated[int, "[1, inf)"],
     max_gaussians: Annotated[int, "[1, inf)", "max_gaussians >= gaussians: at least gaussians"],
     growth: Annotated[float, "[0, inf)"],
@@ -69,7 +70,8 @@ def fit(
     Start: the visual ``hull`` of the hull_views images round the reference frame (null: chosen, see
     :func:`hull_start`), inside at least the share hull_agree of the masks, hull_cells along its longest
     side; or a ``ball``.
-    Curriculum: see :class:`Schedule` for static, grown, coarsest, full (shares).
+    Curriculum: see :class:`Schedule` for static, grown, coarsest, full (shares). blur: variance in pixels^2 that
+    every Gaussian's image has too much at the start and loses evenly until the share full.
     Density: ``gaussians`` at the start; every divide_every steps, up to the share divide_until of the iterations, those
     that are pulled hardest are divided, and the number grows by the share ``growth`` up to max_gaussians. In place of
     the first division with all frames in use, and of the last, hidden ones go: those of which the training images show

@@ -148,7 +148,7 @@ class Fitting:
         background = self._background()
         colour, alpha, _ = rasterize(
             means,
-            scales,
+            self._blurred(scales, view),
             opacities,
             params["sh"],
             view.view,
@@ -169,6 +169,14 @@ class Fitting:
             scales = scales if moved.log_scales is None else scales + moved.log_scales
             opacities = opacities if moved.opacities is None else opacities + moved.opacities
         return (means, torch.exp(scales), torch.sigmoid(opacities)), moved
+
+    def _blurred(self, scales: torch.Tensor, view: cuts.View) -> torch.Tensor:
+        """Scales that make the rendered image less sharp at first: an outline then pulls from further away."""
+        left = self.recipe.blur * (1.0 - self.schedule.sharpness(self.iteration))
+        if left == 0.0:
+            return scales
+        pixel = view.view[2, 3] / view.intrinsics[0, 0]  # at the depth of the thing's middle
+        return torch.sqrt(scales.square() + left * pixel.square())
 
     def _rigidity(self, moved: Deformed) -> dict[str, torch.Tensor]:
         recipe = self.recipe

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -118,6 +119,17 @@ def test_adam_is_torchs_adam():
         optimiser.step()
         own.step("value", mine, 0.01, k)
     torch.testing.assert_close(mine, theirs, rtol=1e-5, atol=1e-6)
+
+
+def test_gaussians_are_blurred_by_so_many_pixels_at_first_and_then_no_more(tmp_path):
+    capture, _ = planted(images=10)
+    recipe = SimpleNamespace(**settings(iterations=100, full=0.5, blur=0.4))
+    fitted = fitting.Fitting(capture, recipe, Workspace(tmp_path))
+    view = cuts.Views(capture, 1.0, fitted.centre, fitted.unit, "cpu")[3]
+    pixels = float(view.intrinsics[0, 0] / view.view[2, 3])  # to a unit of length at the thing's middle
+    for fitted.iteration, variance in ((0, 0.4), (25, 0.2), (50, 0.0), (99, 0.0)):
+        blurred = fitted._blurred(torch.full((5, 1), 0.5 / pixels), view)
+        np.testing.assert_allclose((blurred.numpy() * pixels) ** 2, 0.25 + variance, rtol=1e-5)
 
 
 # splines and nodes

@@ -143,6 +143,14 @@ def test_a_video_shows_the_median_clip_of_the_method_in_focus():
     assert again == data
 
 
+def test_a_driven_shape_is_shown_at_the_files_pace_from_its_beginning():
+    motion = square(200)
+    data = video.driven_video(motion.points, motion.faces, 25.0, azimuth=0.3)
+    done, animation = cv2.imdecodeanimation(np.frombuffer(data, np.uint8))
+    assert done
+    assert list(animation.durations) == [80] * video.LONGEST  # every second frame, and no more than fit
+
+
 @pytest.mark.parametrize("limit", [10**9, 9000])
 def test_a_video_that_is_too_large_is_written_in_less_quality(monkeypatch, limit):
     rng = np.random.default_rng(0)

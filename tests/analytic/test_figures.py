@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -12,7 +13,7 @@ import trimesh
 from tasks.drawing import colours, figures, plot, render
 from tasks.geometry import rigid
 from tasks.geometry.rotations import from_rotation_vector
-from tasks.values import Canonical, Clusters, Motion, Parts, Skeleton, Skinning
+from tasks.values import Canonical, Clusters, Motion, Parts, Rig, Skeleton, Skinning
 
 
 def raster(corners: list, near: list, faces: list, size: int = 4):
@@ -234,6 +235,31 @@ def walker() -> tuple[Motion, Canonical, Skinning, Skeleton, Parts]:
 def test_the_eye_is_where_it_walks_to(walker):
     motion, *_ = walker
     assert np.cos(figures.azimuth_of(motion)) < 0  # on the side of -Z
+
+
+def test_a_skeleton_that_stands_out_of_its_shape_is_not_cut_off(walker):
+    _, shape, _, skeleton, _ = walker
+    long = replace(skeleton, joints=skeleton.joints * np.array([1, 3, 1], np.float32))
+    image = figures.skeleton_figure(shape, long, None, azimuth=0.5)
+    paper = image[0, 0]
+    edge = np.concatenate([image[0], image[:, 0], image[:, -1]])
+    assert (np.abs(edge.astype(int) - paper).max(-1) < 8).all()
+
+
+def test_what_is_as_broad_as_long_is_seen_from_the_front_of_its_skeleton():
+    turn = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+    ring = np.stack([np.cos(turn), 0 * turn, np.sin(turn)], axis=1).astype(np.float32)
+    points = np.stack([ring, ring + np.float32(0.1)]).astype(np.float32)
+    joints = np.array([[0, 0, 0], [2, 0, 0], [-2, 0, 0]], np.float32)  # arms along x: the front is +z
+    still = np.broadcast_to(np.eye(3, dtype=np.float32), (2, 3, 3, 3)), np.zeros((2, 3, 3), np.float32)
+    rig = Rig(("hip", "left", "right"), np.array([-1, 0, 0]), joints, np.ones((40, 3), np.float32) / 3, *still)
+    motion = Motion("ring", points, None, np.array([0, 2]), ("turn",), 30.0, rig=rig)
+    assert figures.azimuth_of(motion) == pytest.approx(0.55)  # a little to the side, for depth
+    quarter = np.array([[0, 0, 1], [0, 1, 0], [-1, 0, 0]], np.float32)
+    rotations = still[0].copy()
+    rotations[:, 0] = quarter  # the body turns to +x
+    turned = replace(motion, rig=replace(rig, rotations=rotations))
+    assert abs(np.sin(figures.azimuth_of(turned) - 0.55)) == pytest.approx(1.0)
 
 
 def test_error_figure_colours_by_error_on_one_scale(walker):

@@ -1,4 +1,4 @@
-"""Where clusters are split and how many are kept, by hand."""
+"""Where clusters are split, how many are kept and what Gaussian bones weigh, by hand."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from tasks.bones.clustering import _seeds, choose_count
+from tasks.bones.gaussian import gaussian_bones
+from tasks.values import Canonical, Clusters, Motion
 
 
 @pytest.mark.parametrize(("slack", "chosen"), [(0.001, 1), (0.02, 0)])
@@ -38,3 +40,30 @@ def test_the_worst_cluster_is_split_first_and_a_good_one_never():
     near = np.arange(9)[:, None]
     assert _seeds(SimpleNamespace(rest=rest), labels, error, near, 5) == [5, 2]
     assert _seeds(SimpleNamespace(rest=rest), labels, error, near, 1) == [5]
+
+
+def test_gaussian_weights_are_a_softmax_of_half_the_squared_mahalanobis_distance():
+    """A long ellipsoid and a flat one, which is as thick as a hundredth of the shape."""
+    rng = np.random.default_rng(0)
+    long, flat = rng.normal(size=(200, 3)) * [3.0, 0.5, 0.5], rng.normal(size=(200, 3)) * [1.0, 1.0, 0.0]
+    points = np.concatenate([long, flat + [6.0, 0.0, 0.0]])
+    labels = np.repeat(np.arange(2), 200)
+    thin = (0.01 * np.linalg.norm(np.ptp(points, axis=0))) ** 2 * np.eye(3)
+    expected = np.empty((400, 2))
+    for b in range(2):
+        own = points[labels == b]
+        away = points - own.mean(0)
+        inverse = np.linalg.inv(np.cov(own.T, bias=True) + thin)
+        expected[:, b] = [np.exp(-0.5 * 0.7 * x @ inverse @ x) for x in away]
+    expected /= expected.sum(1, keepdims=True)
+    motion = Motion("two", np.stack([points, points]), None, np.array([0, 2]), ("a",), 30.0)
+    still = np.zeros((2, 2, 3, 4), np.float32)
+    still[..., :3] = np.eye(3)
+    found = gaussian_bones(
+        motion,
+        Canonical(points.astype(np.float32), None, 0, "first"),
+        Clusters(labels.astype(np.int32), still, np.ones(400, bool), np.zeros(0), np.zeros(0)),
+        sharpness=0.7,
+        influences=2,
+    )
+    np.testing.assert_allclose(found.weights, expected, atol=1e-4)

@@ -9,6 +9,7 @@ import pytest
 
 from tasks.bones.clustering import _seeds, choose_count
 from tasks.bones.gaussian import gaussian_bones
+from tasks.bones.stray import trusted
 from tasks.values import Canonical, Clusters, Motion
 
 
@@ -46,7 +47,7 @@ def test_gaussian_weights_are_a_softmax_of_half_the_squared_mahalanobis_distance
     """A long ellipsoid and a flat one, which is as thick as a hundredth of the shape."""
     rng = np.random.default_rng(0)
     long, flat = rng.normal(size=(200, 3)) * [3.0, 0.5, 0.5], rng.normal(size=(200, 3)) * [1.0, 1.0, 0.0]
-    points = np.concatenate([long, flat + [6.0, 0.0, 0.0]])
+    points = np.concatenate([long, flat + np.array([6.0, 0.0, 0.0])])
     labels = np.repeat(np.arange(2), 200)
     thin = (0.01 * np.linalg.norm(np.ptp(points, axis=0))) ** 2 * np.eye(3)
     expected = np.empty((400, 2))
@@ -67,3 +68,16 @@ def test_gaussian_weights_are_a_softmax_of_half_the_squared_mahalanobis_distance
         influences=2,
     )
     np.testing.assert_allclose(found.weights, expected, atol=1e-4)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+def test_a_point_that_wanders_among_still_ones_is_not_trusted_and_a_loose_part_is(scale):
+    rng = np.random.default_rng(3)
+    rest = rng.uniform(-1, 1, (400, 3))
+    points = np.repeat(rest[None], 20, axis=0)
+    points += 0.002 * rng.normal(size=points.shape)
+    points[:, 7] += 0.4 * rng.normal(size=(20, 3))
+    loose = rest[:, 0] > 0.3
+    points[:, loose] += np.linspace(0, 2, 20)[:, None, None] * np.array([1.0, 0.0, 0.0])
+    found = trusted((scale * points).astype(np.float32), (scale * rest).astype(np.float32), None)
+    assert np.flatnonzero(~found).tolist() == [7]

@@ -192,8 +192,8 @@ class Clusters:
 
 @dataclass(frozen=True)
 class Skinning:
-    """Free-form bones. weights: (N, B), rows sum to one, few non-zeros; transforms: (F, B, 3, 4) on canonical points;
-    rest: (N, 3) canonical points; history: (iterations,) objective, vertex RMSE."""
+    """Free-form bones. weights: (N, B), rows sum to one, few non-zeros; transforms: (F, B, 3, 4) on rest points;
+    rest: (N, 3), near the canonical points or those; history: (iterations,) objective, vertex RMSE."""
 
     rest: np.ndarray
     weights: np.ndarray

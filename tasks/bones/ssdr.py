@@ -1,9 +1,10 @@
 """Smooth skinning decomposition with rigid bones (Le & Deng 2012): the paper's free-form bones.
 
-Skin weights (:mod:`tasks.bones.weights`) and rigid bone transforms (:mod:`tasks.bones.transforms`) take turns, with
-Nesterov extrapolation of the transforms between rounds. Two things keep it out of poor local optima at little cost:
-it starts with more bones than wanted and removes those that are missed least, and it works on a sample of the points
-until the bones stand, for their transforms need far fewer points than a dense mesh has.
+Skin weights (:mod:`tasks.bones.weights`), rest shape (:mod:`tasks.bones.rest`) and rigid bone transforms
+(:mod:`tasks.bones.transforms`) take turns, with Nesterov extrapolation of the transforms between rounds. Two things
+keep it out of poor local optima at little cost: it starts with more bones than wanted and removes those that are missed
+least, and it works on a sample of the points until the bones stand, for their transforms need far fewer points than a
+dense mesh has.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from tasks.bones import transforms, weights
 from tasks.bones.clustering import split
 from tasks.bones.graph import Graph, moving_together
 from tasks.bones.losses import losses
+from tasks.bones.rest import refine
 from tasks.bones.trajectories import Trajectories, compress
 from tasks.geometry.measure import vertex_rmse
 from tasks.geometry.skinning import skin
@@ -48,19 +50,22 @@ def ssdr(
     points_per_bone: Annotated[int, "[6, inf)"],
     smoothness: Annotated[float, "[0, inf)"],
     locality: Annotated[float, "[0, inf)"],
+    firmness: Annotated[float, "[0, inf)"],
     compression: Annotated[float, "(0, inf)"],
     prune: Annotated[float, "[0, 1)", "prune * influences < 1: below 1 / influences"],
     seed: int,
 ) -> Skinning:
-    """Weights W (N, B) and rigid transforms T (F, B, 3, 4) that minimise sum |sum_b w_nb T_fb v_n - x_fn|^2.
+    """Weights W (N, B), rest points v (N, 3) and rigid transforms T (F, B, 3, 4) that minimise
+    sum |sum_b w_nb T_fb v_n - x_fn|^2.
 
     influences: most bones a point may have; surplus: bones to start with, as a multiple of those wanted;
     iterations: rounds once the surplus is gone; points_per_bone: points that take part until the last rounds;
     smoothness: weight of the squared difference to the neighbours' mean weights, against squared errors relative to
     the shape's radius; locality: pull to near bones, sum_b w_nb |v_n - centre_b|^2 (in radii) per degree of evidence,
-    i.e. times the clusters' squared error over F: few frames need it, many hardly feel it; compression: error allowed
-    to the compressed paths, as a fraction of the clusters' own error; prune: weights below are removed in the last
-    rounds. B is the number of clusters. Points that move like nothing around them get weights but do not move bones.
+    i.e. times the clusters' squared error over F: few frames need it, many hardly feel it; firmness: frames that the
+    canonical points count for as the rest shape; compression: error allowed to the compressed paths, as a fraction of
+    the clusters' own error; prune: weights below are removed in the last rounds. B is the number of clusters. Points
+    that move like nothing around them get weights but do not move bones.
     Cost: linear in N and in F.
     history: vertex RMSE after every round, of the sample first, the last exactly that of the result.
     Source: Le & Deng, SIGGRAPH Asia 2012, eq. 2-8,
@@ -77,22 +82,27 @@ def ssdr(
     near_first = locality * (coarse / paths.alignment.scale) ** 2 / train.frames
     part = paths.take(chosen)
     bones = _start(part, clusters.labels[chosen], math.ceil(surplus * wanted), influences)
-    history = _alternate(part, bones, _WARM_UP if len(bones.offsets) > wanted else 0, locality=near_first)
+    history = _alternate(bones, _WARM_UP if len(bones.offsets) > wanted else 0, locality=near_first)
     while len(bones.offsets) > wanted:
-        _remove(part, bones, wanted)
-        history += _alternate(part, bones, _BETWEEN, locality=near_first)
-    history += _alternate(part, bones, iterations, locality=near_first)
-    history += _finish(train, canonical, paths, part, bones, sound, near_first, smoothness, prune)
+        _remove(bones, wanted)
+        history += _alternate(bones, _BETWEEN, locality=near_first)
+    usual = {"locality": near_first, "firmness": firmness}  # the rest shape waits: surplus bones bend it
+    history += _alternate(bones, iterations, **usual)
+    history += _finish(train, canonical, paths, bones, sound, smoothness, prune, usual)
     shares = _dense(bones)
+    rest = paths.alignment.canonical(bones.paths.rest).astype(np.float32)
     moved = paths.alignment.to_world(bones.offsets).astype(np.float32)
-    reached = vertex_rmse(skin(canonical.points, shares, moved), train.points)
-    return Skinning(canonical.points.astype(np.float32), shares, moved, np.append(history, reached))
+    reached = vertex_rmse(skin(rest, shares, moved), train.points)
+    return Skinning(rest, shares, moved, np.append(history, reached))
 
 
 @dataclass
 class _Bones:
-    """The state of the decomposition. index: (N, S) int32, -1 for none; value: (N, S); offsets: (B, 4, 3, F)."""
+    """The state of the decomposition. paths: from the rest shape as it is now; home: (N, 4) canonical points;
+    index: (N, S) int32, -1 for none; value: (N, S); offsets: (B, 4, 3, F)."""
 
+    paths: Trajectories
+    home: np.ndarray
     index: np.ndarray
     value: np.ndarray
     offsets: np.ndarray
@@ -122,27 +132,29 @@ def _start(part: Trajectories, labels: np.ndarray, count: int, influences: int) 
     index[:, 0], value[:, 0] = labels, 1.0
     k, y = transforms.sums(part, index, value, int(labels.max()) + 1)
     each = np.arange(len(k))
-    return _Bones(index, value, transforms.rigid_fit(k[each, each], y)[0])
+    return _Bones(part, part.rest, index, value, transforms.rigid_fit(k[each, each], y)[0])
 
 
 def _alternate(
-    paths: Trajectories,
     bones: _Bones,
     rounds: int,
     *,
     graph: Graph | None = None,
     sound: np.ndarray | None = None,
     smoothness: float = 0.0,
-    locality: float = 0.0,
+    locality: float,
+    firmness: float | None = None,
     prune: float = 0.0,
 ) -> list[float]:
-    """Rounds of weights and transforms, in place. Returns the vertex RMSE after each.
+    """Rounds of weights, transforms and, given a firmness, rest points, in place. Returns the vertex RMSE after each.
 
-    The extrapolation grows while the error falls and starts anew when it rises. Points look for other bones in every
-    second round only.
+    The extrapolation grows while the error falls and starts anew when it rises; the rest shape follows the transforms
+    that were found, not the extrapolated ones, which it would run after. Points look for other bones in every second
+    round only.
     """
     history, before, step = [], bones.offsets, 0.0
     for i in range(rounds):
+        paths = bones.paths
         guess = transforms.extrapolate(bones.offsets, before, step) if step > 0 else bones.offsets.copy()
         forms = weights.forms(paths, guess)
         exchanges = _FIRST_EXCHANGES if i == 0 else (i + 1) % 2
@@ -155,7 +167,7 @@ def _alternate(
             smoothness=smoothness,
             graph=graph,
             locality=locality,
-            centres=_centres(paths, bones),
+            centres=_centres(bones),
         )
         _prune(bones, prune)
         k, y = transforms.sums(paths, _counted(bones.index, sound), bones.value, len(guess))
@@ -163,6 +175,8 @@ def _alternate(
         before, bones.offsets = bones.offsets, guess
         step = 0.0 if history and error > history[-1] else min(0.95, max(0.4, step + 0.1))
         history.append(error)
+        if firmness is not None:
+            bones.paths = refine(paths, guess, bones.index, bones.value, bones.home, firmness)
     return history
 
 
@@ -170,37 +184,29 @@ def _finish(
     train: Motion,
     canonical: Canonical,
     paths: Trajectories,
-    part: Trajectories,
     bones: _Bones,
     sound: np.ndarray,
-    locality: float,
     smoothness: float,
     prune: float,
+    usual: dict[str, float],
 ) -> list[float]:
     """From the sample to all points: each starts with the weights of the sample's nearest point."""
-    near = cKDTree(part.rest[:, :3]).query(paths.rest[:, :3])[1]
+    near = cKDTree(bones.home[:, :3]).query(paths.rest[:, :3])[1]
     bones.index, bones.value = bones.index[near], bones.value[near]
-    history = _alternate(
-        paths,
-        bones,
-        _FINISH,
-        graph=moving_together(train.points, canonical.points, canonical.faces),
-        sound=sound,
-        smoothness=smoothness,
-        locality=locality,
-        prune=prune,
-    )
-    k, y = transforms.sums(paths, _counted(bones.index, sound), bones.value, len(bones.offsets))
+    bones.paths, bones.home = paths, paths.rest
+    graph = moving_together(train.points, canonical.points, canonical.faces)
+    history = _alternate(bones, _FINISH, graph=graph, sound=sound, smoothness=smoothness, prune=prune, **usual)
+    k, y = transforms.sums(bones.paths, _counted(bones.index, sound), bones.value, len(bones.offsets))
     transforms.sweep(k, y, bones.offsets, _SETTLE)
     return history
 
 
-def _centres(paths: Trajectories, bones: _Bones) -> np.ndarray:
+def _centres(bones: _Bones) -> np.ndarray:
     """(B, 3) mean position of each bone's points, by weight, in aligned coordinates."""
     count = len(bones.offsets)
     owner, share = np.where(bones.index >= 0, bones.index, count).ravel(), bones.value.ravel()
     total = np.bincount(owner, share, minlength=count + 1)[:count]
-    place = np.repeat(paths.rest[:, :3], bones.index.shape[1], axis=0)
+    place = np.repeat(bones.paths.rest[:, :3], bones.index.shape[1], axis=0)
     each = [np.bincount(owner, share * place[:, d], minlength=count + 1)[:count] for d in range(3)]
     return np.stack(each, axis=1) / np.maximum(total, 1e-300)[:, None]
 
@@ -210,9 +216,9 @@ def _counted(index: np.ndarray, sound: np.ndarray | None) -> np.ndarray:
     return index if sound is None or sound.all() else np.where(sound[:, None], index, -1).astype(np.int32)
 
 
-def _remove(part: Trajectories, bones: _Bones, wanted: int) -> None:
+def _remove(bones: _Bones, wanted: int) -> None:
     """Removes some of the bones that are missed least, in place; never two that share many points."""
-    count = len(bones.offsets)
+    part, count = bones.paths, len(bones.offsets)
     room = min(count - wanted, max(1, int(_REMOVED * count)))
     loss = losses(part, weights.forms(part, bones.offsets), bones.index, bones.value)
     k, _ = transforms.sums(part, bones.index, bones.value, count)

@@ -38,6 +38,10 @@ class Alignment:
         centred = (np.asarray(canonical, np.float64) - self.centre) / self.scale
         return np.concatenate([centred, np.ones((len(centred), 1))], axis=1)
 
+    def canonical(self, homogeneous: np.ndarray) -> np.ndarray:
+        """The way back: (N, 4) -> (N, 3)."""
+        return self.centre + self.scale * homogeneous[:, :3]
+
     def to_world(self, offsets: np.ndarray) -> np.ndarray:
         """(B, 4, 3, F) bone offsets, see :mod:`tasks.bones.transforms` -> (F, B, 3, 4) float64 on canonical points."""
         local = np.moveaxis(offsets, (3, 0, 2, 1), (0, 1, 2, 3)).copy()  # (F, B, 3, 4)
@@ -172,6 +176,8 @@ def _project(points, rest, back, basis, path, start, stop):
 def _basis(paths: np.ndarray, allowed: float) -> np.ndarray:
     """Orthonormal columns that leave at most `allowed` of the squared length of paths (S, 3F) unexplained.
 
+    The first three are shifts that last: with them a rest point can be moved (:mod:`tasks.bones.rest`).
+
     Randomised block range finder with one power iteration (Martinsson & Voronin 2016, randQB_EI), grown block by block
     so that the rank need not be known. Short sequences keep all their dimensions: there is nothing to win.
     """
@@ -179,9 +185,10 @@ def _basis(paths: np.ndarray, allowed: float) -> np.ndarray:
     if width <= 3 * _BLOCK:
         return np.eye(width)
     rng = np.random.default_rng(0)  # probes of a subspace, not a setting: the result is the same for any good seed
-    left = paths.copy()
-    basis = np.zeros((min(count, width), width))
-    found = 0
+    basis = np.zeros((min(count + 3, width), width))
+    basis[:3] = np.repeat(np.eye(3), width // 3, axis=1) / math.sqrt(width // 3)
+    left = paths - product(product(paths, basis[:3].T), basis[:3])
+    found = 3
     while found < len(basis) and np.sum(left**2) > allowed:
         size = min(_BLOCK, len(basis) - found)
         block = product(rng.standard_normal((size, count)), left)

@@ -28,7 +28,7 @@ def bones_glb(
     *,
     name: str,
 ) -> Files:
-    """The canonical shape on the free-form bones, moving as the method says, or without one as fitted.
+    """The free-form bones' rest shape on them, moving as the method says, or without one as fitted.
 
     motion: whose clips the frames are, for names and rate; the bones stand side by side, each at the centre of what it
     moves. A method that moves no bones gets :func:`skeleton_glb` instead; InputError where its points are not what the
@@ -47,10 +47,10 @@ def bones_glb(
         return skeleton_glb(canonical, skeleton, motion, poses, name=name)
     transforms = skinning.transforms if animation is None else animation.bones
     bones = transforms.shape[1]
-    joints = _centres(canonical.points, skinning.weights)
+    joints = _centres(skinning.rest, skinning.weights)
     character = Character(
         name=name,
-        rest=canonical.points,
+        rest=skinning.rest,
         faces=canonical.faces,
         weights=skinning.weights,
         names=tuple(f"bone{b:03d}" for b in range(bones)),

@@ -25,6 +25,7 @@ SSDR = {
     "points_per_bone": 80,
     "smoothness": 0.0,
     "locality": 0.0,
+    "firmness": 1.0,
     "compression": 0.01,
     "prune": 0.0,
     "seed": 0,
@@ -95,6 +96,20 @@ def test_planted_weights_and_bones_are_recovered() -> None:
     assert np.abs(skinning.weights[:, order] - weights).mean() < 0.02
 
 
+def test_a_canonical_frame_that_bones_cannot_show_does_not_spoil_the_others() -> None:
+    rng = np.random.default_rng(11)
+    points, labels = boxes(rng, 4)
+    moved = rigid.apply(random_transforms(rng, 40, 4)[:, labels], points)
+    dented = canonical_of(points + 0.02 * np.sin(9 * points[:, ::-1]))
+    clusters = cluster(motion_of(moved), dented, **{**CLUSTERING, "max_bones": 4, "count": "fixed"})
+    held = ssdr(motion_of(moved), dented, clusters, **SSDR | {"firmness": 1e9})
+    free = ssdr(motion_of(moved), dented, clusters, **SSDR)
+    np.testing.assert_allclose(held.rest, dented.points, atol=1e-6)
+    assert free.history[-1] < 0.1 * held.history[-1]
+    shape = rigid.procrustes(free.rest[labels == 0].astype(np.float64), points[None, labels == 0])
+    np.testing.assert_allclose(rigid.apply(shape, free.rest[labels == 0]), points[labels == 0], atol=4e-3)
+
+
 def test_transforms_are_rigid_and_weights_are_a_partition() -> None:
     rng = np.random.default_rng(4)
     points, labels = boxes(rng, 4)
@@ -109,7 +124,7 @@ def test_transforms_are_rigid_and_weights_are_a_partition() -> None:
     assert (skinning.weights > 0).sum(1).max() <= 3
     assert skinning.weights[skinning.weights > 0].min() >= 0.02
     assert skinning.history[-1] == pytest.approx(
-        vertex_rmse(skin(points, skinning.weights, skinning.transforms), moved)
+        vertex_rmse(skin(skinning.rest, skinning.weights, skinning.transforms), moved)
     )
 
 
@@ -141,7 +156,7 @@ def test_refit_on_unseen_frames_finds_their_transforms() -> None:
     clusters = cluster(motion_of(moved[:40]), canonical_of(points), **{**CLUSTERING, "max_bones": 3, "count": "fixed"})
     skinning = ssdr(motion_of(moved[:40]), canonical_of(points), clusters, **{**SSDR, "iterations": 80})
     unseen = refit_bones(motion_of(moved[40:]), skinning)
-    assert vertex_rmse(skin(points, skinning.weights, unseen), moved[40:]) < 2e-3 * diagonal(points)
+    assert vertex_rmse(skin(skinning.rest, skinning.weights, unseen), moved[40:]) < 2e-3 * diagonal(points)
 
 
 def test_stillness_and_duplicates_do_not_crash() -> None:

@@ -9,6 +9,7 @@ import pytest
 from scipy.optimize import nnls
 
 from tasks.bones import transforms, weights
+from tasks.bones.rest import refine
 from tasks.bones.trajectories import Trajectories, compress
 from tasks.geometry import rigid, rotations
 
@@ -94,6 +95,24 @@ def test_sums_and_error(case: tuple[Trajectories, np.ndarray, np.ndarray]) -> No
     np.testing.assert_allclose(y.reshape(5, 4, -1), np.einsum("nb,ni,nx->bix", w, paths.rest, u), atol=1e-6)
     plain = np.sum((np.einsum("nb,nbx->nx", w, moved(paths, offsets)) - u) ** 2)
     assert paths.squared + transforms.sweep(k, y, offsets.copy(), 0) == pytest.approx(plain, rel=1e-6)
+
+
+@pytest.mark.parametrize("firmness", [0.0, 3.0])
+def test_rest_points_against_least_squares(case: tuple[Trajectories, np.ndarray, np.ndarray], firmness: float) -> None:
+    """The canonical point counts for `firmness` frames beside those of the path; what moves stays where it was."""
+    paths, offsets, u = case
+    w = np.random.default_rng(3).dirichlet(np.ones(5), 40)
+    index = np.tile(np.arange(5, dtype=np.int32), (40, 1))
+    home = paths.rest + np.append(0.1 * np.random.default_rng(4).standard_normal(3), 0.0)
+    found = refine(paths, offsets, index, w, home, firmness)
+    local = np.einsum("nb,bidf->nfdi", w, offsets) + np.eye(3, 4)  # the blended transform of each point and frame
+    target = paths.rest[:, None, :3] + u.reshape(40, 3, 6).transpose(0, 2, 1)
+    for n in range(40):
+        a = np.concatenate([*local[n, :, :, :3], np.sqrt(firmness) * np.eye(3)])
+        x = np.append((target[n] - local[n, :, :, 3]).ravel(), np.sqrt(firmness) * home[n, :3])
+        np.testing.assert_allclose(found.rest[n, :3], np.linalg.lstsq(a, x, rcond=None)[0], atol=1e-5)
+    after = (found.path.astype(np.float64) @ paths.basis.T).reshape(40, 3, 6).transpose(0, 2, 1)
+    np.testing.assert_allclose(found.rest[:, None, :3] + after, target, atol=1e-5)
 
 
 def test_a_sweep_never_raises_the_error_and_ends_where_bones_agree(

@@ -24,6 +24,7 @@ SSDR = {
     "points_per_bone": 120,
     "smoothness": 1e-5,
     "locality": 8.0,
+    "firmness": 1.0,
     "compression": 0.06,
     "prune": 0.0,
     "seed": 0,

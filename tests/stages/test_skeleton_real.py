@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import igl
 import numpy as np
@@ -24,6 +24,7 @@ from tasks.skeleton.joints_gradient import joints_by_gradient
 from tasks.skeleton.joints_motion import joints_by_motion
 from tasks.skeleton.poses import fit_poses
 from tasks.skeleton.surface import closed_surface
+from tasks.skeleton.symmetry import find_mirror
 from tasks.values import Canonical, Curve, Motion, Skeleton, Skinning, Surface
 from tests.shipped import shipped
 
@@ -87,12 +88,16 @@ def fox(shared_data) -> Found:
     return prepare(thinned(motion), "rest")
 
 
+@pytest.fixture(scope="module")
+def skeleton(fox) -> Skeleton:
+    return fox.joints(joints_by_motion, "motion")
+
+
 @pytest.mark.slow
-def test_joints_of_a_fox_lie_where_its_rig_has_them(fox):
+def test_joints_of_a_fox_lie_where_its_rig_has_them(fox, skeleton):
     truth = counting_joints(fox.motion.rig, 5.0)
     size = diagonal(fox.canonical.points)
-    by_motion = fox.joints(joints_by_motion, "motion")
-    ours = joint_scores(by_motion.joints, by_motion.parents, *truth, size)
+    ours = joint_scores(skeleton.joints, skeleton.parents, *truth, size)
     by_gradient = fox.joints(joints_by_gradient, "gradient")
     papers = joint_scores(by_gradient.joints, by_gradient.parents, *truth, size)
     assert ours["f1"] > 0.75
@@ -100,16 +105,50 @@ def test_joints_of_a_fox_lie_where_its_rig_has_them(fox):
     assert ours["link_f1"] > 0.75
     assert ours["f1"] > papers["f1"]
     assert ours["j2j"] < papers["j2j"]
-    assert len(by_motion.joints) <= shipped("skeleton.motion")["max_joints"]
+    assert len(skeleton.joints) <= shipped("skeleton.motion")["max_joints"]
 
 
 @pytest.mark.slow
-def test_a_posed_fox_lies_on_its_points_and_its_joints_inside(fox):
-    skeleton = fox.joints(joints_by_motion, "motion")
+def test_a_posed_fox_lies_on_its_points_and_its_joints_inside(fox, skeleton):
+    assert skeleton.parents[0] == -1
+    assert (skeleton.parents[1:] < np.arange(1, len(skeleton.parents))).all()
+    assert (skeleton.parents[1:] >= 0).all()  # one root
     assert fox.lbs_percent(skeleton) < 0.15
     vertices, faces = fox.surface.vertices.astype(np.float64), fox.surface.faces.astype(np.int64)
     assert igl.fast_winding_number(vertices, faces, skeleton.joints.astype(np.float64)).min() > 0.5
     assert (skeleton.weights.sum(axis=0) > 0).all()
+
+
+@pytest.mark.slow
+def test_left_and_right_of_the_fox_have_as_many_joints(fox, skeleton):
+    mirror = find_mirror(fox.surface)
+    partners = mirror.partners(skeleton.joints)
+    sides = (partners >= 0) & (partners != np.arange(len(partners)))
+    across = (skeleton.joints - mirror.centre) @ mirror.normal
+    assert np.sum(across[sides] > 0) == np.sum(across[sides] < 0) >= 8  # two or more joints a leg
+    assert np.abs(across[~sides]).max() < 0.02 * mirror.size  # what has no partner lies in the middle
+
+
+@pytest.mark.slow
+def test_fewer_frames_give_the_fox_the_same_tree(fox, skeleton):
+    some = fox.motion.take_frames([slice(0, int(0.8 * fox.motion.frames))], ["some"])
+    clusters = cluster(some, fox.canonical, **settings("bones", cluster))
+    skinning = ssdr(some, fox.canonical, clusters, **settings("bones", ssdr))
+    found = replace(fox, motion=some, skinning=skinning).joints(joints_by_motion, "motion")
+    assert abs(len(found.joints) - len(skeleton.joints)) <= 3
+    truth = (skeleton.joints, skeleton.parents)
+    scores = joint_scores(found.joints, found.parents, *truth, diagonal(fox.canonical.points))
+    assert scores["f1"] > 0.85
+    assert scores["link_f1"] > 0.85
+
+
+@pytest.mark.slow
+def test_poses_of_a_walking_fox_never_flip(shared_data, fox, skeleton):
+    path = shared_data / "rigged_quaternius" / "decoded" / "fox.npz"
+    motion = rigged_character.load(path=str(path), fps=24.0, hierarchy="attached", unit="unit")
+    walk = next(c for c, name in zip(motion.clips(), motion.clip_names, strict=True) if "Walk" in name)
+    poses = fit_poses(motion.take_frames([walk], ["walk"]), fox.canonical, skeleton, **shipped("skeleton.poses"))
+    assert np.degrees(geodesic(poses.rotations[1:], poses.rotations[:-1])).max() < 45.0
 
 
 @pytest.mark.slow

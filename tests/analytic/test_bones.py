@@ -11,7 +11,6 @@ from tasks.bones.refit import refit_bones
 from tasks.bones.rigid import rigid_skinning
 from tasks.bones.rotation import nearest_rotation
 from tasks.bones.ssdr import ssdr
-from tasks.errors import InputError
 from tasks.geometry import rigid, rotations
 from tasks.geometry.measure import diagonal, vertex_rmse
 from tasks.geometry.skinning import skin
@@ -205,15 +204,6 @@ def test_nearest_rotation_against_singular_values(kind: str) -> None:
         assert np.sum(r * m) >= best - 1e-9 * np.linalg.norm(m)
         np.testing.assert_allclose(r @ r.T, np.eye(3), atol=1e-12)
         assert np.linalg.det(r) > 0.999
-
-
-def test_pruning_all_weights_of_a_point_is_refused() -> None:
-    rng = np.random.default_rng(9)
-    points, labels = boxes(rng, 2)
-    motion = motion_of(rigid.apply(random_transforms(rng, 10, 2)[:, labels], points))
-    clusters = cluster(motion, canonical_of(points), **CLUSTERING)
-    with pytest.raises(InputError, match=r"bones\.prune"):
-        ssdr(motion, canonical_of(points), clusters, **SSDR | {"prune": 0.5})
 
 
 def test_spread_shares_points_with_their_neighbours() -> None:

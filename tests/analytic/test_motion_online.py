@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from tasks.benchmarks.matching import benchmark_matching
-from tasks.errors import InputError
 from tasks.geometry.measure import vertex_rmse
 from tasks.motion.matching import Way, prepare
 from tasks.motion.online import DELAY, Online, WindowSearch
@@ -61,5 +60,3 @@ def test_the_benchmark_finds_every_nearest_window(train):
     assert named["recall_at_7"] == 1.0
     assert named["points_count"] == 200
     assert min(named[n] for n in ("fps", "p99_ms", "clip_fps", "query_ms@50", "query_ms@400", "build_seconds")) > 0
-    with pytest.raises(InputError, match=r"benchmark\.patches"):
-        benchmark_matching(train, planted.poses([UNSEEN]), matching=way, **sizes | {"patches": []}, threads=1, seed=0)

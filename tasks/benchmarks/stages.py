@@ -49,50 +49,65 @@ def benchmark_stages(
     of what the process used before it had the fine mesh. Raises InputError for bare points.
     """
     _check(train)
-
-    def run(seen: Motion, unseen: Motion, shape: Canonical) -> dict[str, Cost]:
-        costs: dict[str, Cost] = {}
-
-        def timed(name: str, work: Callable[[], object]) -> object:
-            before = in_use()
-            result, cost = measure(work)
-            top = None if before is None or cost.memory is None else before + cost.memory - start
-            costs[name] = Cost(cost.seconds, cost.cpu, top)
-            return result
-
-        clusters = timed("clusters", lambda: cluster(seen, shape, **clustering))
-        bones = timed("bones", lambda: ssdr(seen, shape, clusters, **decomposition))
-        surface = timed("surface", lambda: closed_surface(shape, **closing))
-        curve = timed("curve", lambda: curve_skeleton(surface, **tracing))
-        skeleton = timed("skeleton", lambda: joints_by_motion(seen, shape, bones, surface, curve, **jointing))
-        poses = timed("poses", lambda: fit_poses(seen, shape, skeleton, **posing))
-        query = timed("poses, unseen", lambda: fit_poses(unseen, shape, skeleton, **posing))
-        parts = timed("parts", lambda: find_parts(skeleton, bones, **parting))
-        database = timed("database", lambda: build_database(seen, bones, poses))
-        known = Training(seen, shape, bones, skeleton, database, parts)
-        timed("PartMM", lambda: partmm.animate(known, query, **matching))
-        return costs
-
+    settings = {
+        "clusters": clustering,
+        "bones": decomposition,
+        "surface": closing,
+        "curve": tracing,
+        "skeleton": jointing,
+        "poses": posing,
+        "parts": parting,
+        "PartMM": matching,
+    }
     with threads_held(threads):
-        start = in_use() or 0.0
-        run(train, test, canonical)  # compiles
-        start = in_use() or 0.0
+        _run(train, test, canonical, settings, in_use())  # compiles
+        start = in_use()
         (fine, shape), (unseen, _) = finer(train, canonical, subdivisions), finer(test, canonical, subdivisions)
-        runs = [run(fine, unseen, shape) for _ in range(repeats)]
+        runs = [_run(fine, unseen, shape, settings, start) for _ in range(repeats)]
     costs = {name: median([costs[name] for costs in runs]) for name in runs[0]}
-    found = {
+    counts = {
         "points_count": float(len(shape.points)),
         "frames_count": float(fine.frames),
         "bones_count": float(clustering["max_bones"]),
-        "seconds": sum(c.seconds for c in costs.values()),
-        "cpu_seconds": sum(c.cpu for c in costs.values()),
     }
+    return declared(counts | _numbers(costs), train.unit)
+
+
+def _run(
+    seen: Motion, unseen: Motion, shape: Canonical, settings: dict[str, dict], start: float | None
+) -> dict[str, Cost]:
+    """Stage -> its cost, all run once, in their order; memory is what is in use at the peak on top of `start` (MB)."""
+    costs: dict[str, Cost] = {}
+
+    def timed(name: str, work: Callable[..., object], *inputs: object, of: str | None = None) -> object:
+        before = in_use()
+        result, cost = measure(lambda: work(*inputs, **settings.get(of or name, {})))
+        top = None if before is None or cost.memory is None else before + cost.memory - start
+        costs[name] = Cost(cost.seconds, cost.cpu, top)
+        return result
+
+    clusters = timed("clusters", cluster, seen, shape)
+    bones = timed("bones", ssdr, seen, shape, clusters)
+    surface = timed("surface", closed_surface, shape)
+    curve = timed("curve", curve_skeleton, surface)
+    skeleton = timed("skeleton", joints_by_motion, seen, shape, bones, surface, curve)
+    poses = timed("poses", fit_poses, seen, shape, skeleton)
+    query = timed("poses, unseen", fit_poses, unseen, shape, skeleton, of="poses")
+    parts = timed("parts", find_parts, skeleton, bones)
+    database = timed("database", build_database, seen, bones, poses)
+    timed("PartMM", partmm.animate, Training(seen, shape, bones, skeleton, database, parts), query)
+    return costs
+
+
+def _numbers(costs: dict[str, Cost]) -> dict[str, float]:
+    """Costs of all stages together and of each, by the names of their metrics; memory where the system says."""
+    found = {"seconds": sum(c.seconds for c in costs.values()), "cpu_seconds": sum(c.cpu for c in costs.values())}
     if all(c.memory is not None for c in costs.values()):
         found["memory"] = max(c.memory for c in costs.values())
     for name, cost in costs.items():
         found |= {f"seconds@{name}": cost.seconds, f"cpu_seconds@{name}": cost.cpu}
         found |= {} if cost.memory is None else {f"memory@{name}": cost.memory}
-    return declared(found, train.unit)
+    return found
 
 
 def finer(motion: Motion, canonical: Canonical, subdivisions: int) -> tuple[Motion, Canonical]:

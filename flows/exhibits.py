@@ -11,7 +11,8 @@ from flows.pipeline import Planned, file_name
 from flows.source import signature
 from tasks.errors import InputError
 
-IN_VIDEOS = (("robust_lbs", "lbs"), ("fullmm",), ("partmm",))  # side by side: the first of each that was run
+# side by side: the first of each that was run
+IN_VIDEOS = (("robust_lbs", "lbs"), ("fullmm",), ("partmm",), ("part_cloth", "part_kernel"))
 PANELS = 4  # methods or variants side by side in the picture of errors
 
 

@@ -100,12 +100,12 @@ def split(part: Trajectories, labels: np.ndarray, ceiling: int, rounds: int, flo
         if count >= ceiling or part.alignment.scale * np.sqrt(error.mean()) <= floor:
             break
         most, stalled = max(most, count), stalled + 1 if count <= most else 0
-        labels = _compact(found)
+        labels = numbered(found)
         seeds = _seeds(part, labels, error, near, ceiling - int(labels.max()) - 1)
         for new, seed in enumerate(seeds, start=int(labels.max()) + 1):
             members = near[seed]
             labels[members[labels[members] == labels[seed]]] = new
-        labels = _reassign(part, _compact(labels), rounds)
+        labels = _reassign(part, numbered(labels), rounds)
     return labels
 
 
@@ -136,13 +136,14 @@ def _reassign(part: Trajectories, labels: np.ndarray, rounds: int) -> np.ndarray
         if small[found].any() and not small.all():
             kept = np.nonzero(~small)[0]
             found = weights.nearest_bone(part, offsets[kept])[0]
-        labels = _compact(found)
+        labels = numbered(found)
     return labels
 
 
-def _compact(labels: np.ndarray) -> np.ndarray:
-    """The same clusters numbered without gaps."""
-    return np.unique(labels, return_inverse=True)[1].reshape(-1).astype(np.int32)
+def numbered(labels: np.ndarray) -> np.ndarray:
+    """The same clusters numbered without gaps, (N,) int32."""
+    used = np.bincount(labels) > 0
+    return (np.cumsum(used) - 1).astype(np.int32)[labels]
 
 
 def _merge_down(part: Trajectories, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
@@ -172,7 +173,7 @@ def _merge_down(part: Trajectories, labels: np.ndarray) -> tuple[np.ndarray, np.
         states.append(current.copy())
         errors.append(part.rmse(energy + gain[alive].sum()))
     counts = np.arange(1, len(states) + 1)
-    return counts, np.array(errors[::-1]), [_compact(s) for s in states[::-1]]
+    return counts, np.array(errors[::-1]), [numbered(s) for s in states[::-1]]
 
 
 def _pair_costs(k: np.ndarray, y: np.ndarray, gain: np.ndarray, a: int, others: np.ndarray, cost: np.ndarray) -> None:

@@ -11,12 +11,16 @@ from numba import njit
 
 from tasks.geometry.parallel import for_chunks
 
+_ROWS = 32  # rows of a product that a thread takes at a time, or more of small ones:
+_WORTH = 1 << 20  # multiplications below which a thread is not worth its start
+
 
 def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """a @ b in float64. a: (M, K), b: (K, L) -> (M, L)."""
     a, b = np.ascontiguousarray(a, np.float64), np.ascontiguousarray(b, np.float64)
     out = np.zeros((a.shape[0], b.shape[1]))
-    for_chunks(lambda start, stop: add_product(a, b, out, start, stop), len(a), 32)
+    rows = max(_ROWS, _WORTH // max(b.size, 1))
+    for_chunks(lambda start, stop: add_product(a, b, out, start, stop), len(a), rows)
     return out
 
 

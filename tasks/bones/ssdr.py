@@ -17,13 +17,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from tasks.bones import transforms, weights
-from tasks.bones.clustering import split
+from tasks.bones.clustering import numbered, split
 from tasks.bones.graph import Graph, moving_together
 from tasks.bones.losses import losses
 from tasks.bones.rest import refine
+from tasks.bones.skinned import skinned_rmse
 from tasks.bones.trajectories import Trajectories, compress
-from tasks.geometry.measure import vertex_rmse
-from tasks.geometry.skinning import skin
 from tasks.values import Canonical, Clusters, Motion, Skinning
 
 _SPAN = 1000  # points from which the basis of all paths is taken, and the fewest that a fit is made on
@@ -89,11 +88,10 @@ def ssdr(
     usual = {"locality": near_first, "firmness": firmness}  # the rest shape waits: surplus bones bend it
     history += _alternate(bones, iterations, **usual)
     history += _finish(train, canonical, paths, bones, sound, smoothness, prune, usual)
-    shares = _dense(bones)
     rest = paths.alignment.canonical(bones.paths.rest).astype(np.float32)
     moved = paths.alignment.to_world(bones.offsets).astype(np.float32)
-    reached = vertex_rmse(skin(rest, shares, moved), train.points)
-    return Skinning(rest, shares, moved, np.append(history, reached))
+    reached = skinned_rmse(rest, bones.index, bones.value.astype(np.float32), moved, train.points)
+    return Skinning(rest, _dense(bones), moved, np.append(history, reached))
 
 
 @dataclass
@@ -115,18 +113,14 @@ def _thinned(chosen: np.ndarray) -> np.ndarray:
 def _clusters_error(train: Motion, canonical: Canonical, clusters: Clusters, chosen: np.ndarray) -> float:
     """Vertex RMSE of the rigid clusters on some of the points: the scale against which other errors are small."""
     chosen = _thinned(chosen)
-    rest, labels = canonical.points[chosen].astype(np.float64), clusters.labels[chosen]
-    total = 0.0
-    for t, x in zip(clusters.transforms, train.points, strict=True):
-        moved = np.einsum("nij,nj->ni", t[labels][..., :3].astype(np.float64), rest) + t[labels][..., 3]
-        total += float(np.sum((moved - x[chosen]) ** 2))
-    return float(np.sqrt(total / (len(chosen) * train.frames)))
+    labels = clusters.labels[chosen][:, None]
+    whole = np.ones(labels.shape, np.float32)
+    return skinned_rmse(canonical.points[chosen], labels, whole, clusters.transforms, train.points[:, chosen])
 
 
 def _start(part: Trajectories, labels: np.ndarray, count: int, influences: int) -> _Bones:
     """Rigid clusters, split further to the given count; every point follows its own."""
-    labels = np.unique(labels, return_inverse=True)[1].reshape(-1).astype(np.int32)
-    labels = split(part, labels, count, _LLOYD, _STILL * part.alignment.scale)
+    labels = split(part, numbered(labels), count, _LLOYD, _STILL * part.alignment.scale)
     index = np.full((len(labels), influences), -1, np.int32)
     value = np.zeros(index.shape)
     index[:, 0], value[:, 0] = labels, 1.0
@@ -194,7 +188,7 @@ def _finish(
     near = cKDTree(bones.home[:, :3]).query(paths.rest[:, :3])[1]
     bones.index, bones.value = bones.index[near], bones.value[near]
     bones.paths, bones.home = paths, paths.rest
-    graph = moving_together(train.points, canonical.points, canonical.faces)
+    graph = moving_together(train.points, canonical.points, canonical.faces) if smoothness > 0 else None
     history = _alternate(bones, _FINISH, graph=graph, sound=sound, smoothness=smoothness, prune=prune, **usual)
     k, y = transforms.sums(bones.paths, _counted(bones.index, sound), bones.value, len(bones.offsets))
     transforms.sweep(k, y, bones.offsets, _SETTLE)

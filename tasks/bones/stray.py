@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from scipy.spatial import cKDTree
 
+from tasks.bones.graph import unsteadiness
 from tasks.geometry.neighbours import mesh_edges
-from tasks.geometry.parallel import for_chunks
 
 _REFERENCE = 8000  # points that others are compared with
 _NEAREST = 8
@@ -29,17 +28,13 @@ def trusted(points: np.ndarray, canonical: np.ndarray, faces: np.ndarray | None)
     reference = np.unique(np.linspace(0, total - 1, min(total, _REFERENCE)).round().astype(int))
     _, near = cKDTree(canonical[reference]).query(canonical, k=_NEAREST + 1)
     near = reference[near]
-    frames = np.unique(np.linspace(0, len(points) - 1, _FRAMES).round().astype(int))
-    some = np.ascontiguousarray(points[frames], np.float64)
-    change = np.empty((total, near.shape[1]))
     rest, each = canonical.astype(np.float64), np.arange(total)
-    for_chunks(lambda start, stop: _unsteadiness(some, rest, each, near, change, start, stop), total, 2048)
+    change = unsteadiness(points, canonical, each, near, _FRAMES)
     change[near == each[:, None]] = np.nan
     own = np.sort(change, axis=1)[:, _STEADIEST]  # not-a-number comes last
     if faces is not None:
         a, b = mesh_edges(faces).T
-        edge = np.empty((len(a), 1))
-        for_chunks(lambda start, stop: _unsteadiness(some, rest, a, b[:, None], edge, start, stop), len(a), 2048)
+        edge = unsteadiness(points, canonical, a, b[:, None], _FRAMES)
         np.minimum.at(own, a, edge[:, 0])
         np.minimum.at(own, b, edge[:, 0])
     around = np.minimum(
@@ -47,21 +42,3 @@ def trusted(points: np.ndarray, canonical: np.ndarray, faces: np.ndarray | None)
     )  # strays may have strays around them
     low, high = np.percentile(rest, [5, 95], axis=0)
     return (own <= _TIMES * around) | (own <= _LEAST * np.linalg.norm(high - low))
-
-
-@njit(cache=True, nogil=True)
-def _unsteadiness(points, rest, index, near, change, start, stop):
-    """change[i, k]: root mean square, over frames, of the change of the distance from index[i] to near[i, k]."""
-    for i in range(start, stop):
-        n = index[i]
-        for k in range(near.shape[1]):
-            other = near[i, k]
-            before = np.sqrt(np.sum((rest[n] - rest[other]) ** 2))
-            total = 0.0
-            for f in range(len(points)):
-                squared = 0.0
-                for d in range(3):
-                    gap = points[f, n, d] - points[f, other, d]
-                    squared += gap * gap
-                total += (np.sqrt(squared) - before) ** 2
-            change[i, k] = np.sqrt(total / len(points))

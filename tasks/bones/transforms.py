@@ -20,6 +20,7 @@ from tasks.geometry.parallel import for_chunks
 
 _POINTS = 2048  # points whose sums are taken together
 _FRAMES = 64  # frames solved together: enough for long inner loops, and their offsets fit the second-level cache
+_WORTH = 2048  # rotations below which a thread is not worth its start
 _HOLD = 1e-7  # how firmly a rotation that the points do not determine keeps its last value
 
 
@@ -64,7 +65,8 @@ def rigid_fit(k: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The best rigid transform of groups of points that share none. k: (B, 4, 4); y: (B, 4, 3, F)
     -> offsets (B, 4, 3, F) and, for each group, E - sum |u|^2."""
     offsets, gain = np.zeros_like(y), np.zeros(len(k))
-    for_chunks(lambda start, stop: _rigid_fit(k, y, offsets, gain, start, stop), len(k), 4)
+    groups = max(4, _WORTH // y.shape[3])
+    for_chunks(lambda start, stop: _rigid_fit(k, y, offsets, gain, start, stop), len(k), groups)
     return offsets, gain
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from tasks.evaluation.fragments import bone_fragments
 from tasks.evaluation.joints import counting_joints, joint_scores
 from tasks.evaluation.metrics import FRAMES_AT_ONCE, declared, squared_errors
-from tasks.geometry import kinematics, measure
+from tasks.geometry import kinematics, measure, rigid
 from tasks.geometry.skinning import skin
 from tasks.values import Canonical, Metrics, Motion, Poses, Rig, Skeleton, Skinning
 
@@ -24,7 +24,7 @@ def evaluate_rig(
     """Error of the bones alone and of the skeleton alone on the frames they were fitted to, and their counts.
 
     Where the data has a true rig and the skeleton is another, its joints are scored too (``tasks.evaluation.joints``);
-    true joints count when they turn more than ``turn`` degrees from their parent somewhere.
+    true joints count when they turn more than ``turn`` degrees from where they are in the canonical shape somewhere.
     """
 
     def bones(piece: slice) -> np.ndarray:
@@ -67,13 +67,15 @@ def _against_truth(train: Motion, canonical: Canonical, skeleton: Skeleton, turn
 
 
 def at_canonical(rig: Rig, canonical: Canonical) -> Rig:
-    """The true rig with its joints where they are in the canonical shape, which may be a posed frame."""
+    """The true rig bound anew in the canonical shape, which may be a posed frame: joints where they are there, turns
+    from there. A joint that is bent in the canonical frame and in all others alike moves nothing."""
     if canonical.frame < 0:
         return rig
-    frame = slice(canonical.frame, canonical.frame + 1)
-    transforms = kinematics.forward(rig.parents, rig.joints, rig.rotations[frame], rig.translations[frame])
-    joints = kinematics.joint_positions(transforms, rig.joints)[0]
-    return Rig(rig.names, rig.parents, joints, rig.weights, rig.rotations, rig.translations)
+    transforms = kinematics.forward(rig.parents, rig.joints, rig.rotations, rig.translations)
+    there = transforms[canonical.frame]
+    joints = kinematics.joint_positions(there, rig.joints)
+    since = rigid.compose(transforms, rigid.inverse(there))
+    return Rig(rig.names, rig.parents, joints, rig.weights, *kinematics.local_poses(rig.parents, joints, since))
 
 
 def _rmse_in_pieces(make: Callable[[slice], np.ndarray], truth: np.ndarray) -> float:

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from tasks.errors import InputError
+from tasks.evaluation.joints import counting_joints
 from tasks.evaluation.metrics import METRICS, clip_keys, evaluate, frame_rmse, metric_of, score, unit_of
 from tasks.evaluation.rig import at_canonical, evaluate_rig
 from tasks.geometry import rigid
+from tasks.geometry.rotations import from_rotation_vector
 from tasks.reporting.rows import COLUMNS, from_csv, join, rows_of, to_csv
 from tasks.values import Animation, Canonical, Metrics, Motion, Poses, Rig, Skeleton, Skinning
 
@@ -73,8 +75,21 @@ def test_true_joints_are_taken_where_the_canonical_frame_has_them():
     turns[1, 0] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]  # the root turns by 90 degrees about z
     joints = np.array([[1, 0, 0], [3, 0, 0]], np.float32)
     rig = Rig(("a", "b"), np.array([-1, 0]), joints, np.ones((4, 2)) / 2, turns, np.zeros((2, 2, 3), np.float32))
-    assert np.allclose(at_canonical(rig, Canonical(BOX, None, 1, "")).joints, [[1, 0, 0], [1, 2, 0]])
+    found = at_canonical(rig, Canonical(BOX, None, 1, ""))
+    assert np.allclose(found.joints, [[1, 0, 0], [1, 2, 0]])
+    assert np.allclose(found.rotations[1], np.eye(3), atol=1e-6)
+    assert np.allclose(found.rotations[0, 0], turns[1, 0].T, atol=1e-6)
+    assert np.allclose(found.translations, 0.0, atol=1e-6)
     assert at_canonical(rig, Canonical(BOX, None, -1, "rest")) is rig
+
+
+def test_true_joints_that_keep_the_turn_of_the_canonical_frame_do_not_count():
+    """Both are bent at rest already, one of them goes on turning."""
+    turns = from_rotation_vector(np.array([[[0, 0, 0.5], [0, 0, 0.5]], [[0, 0, 0.5], [0, 0, 0.9]]]))
+    joints = np.array([[1, 0, 0], [3, 0, 0]], np.float32)
+    rig = Rig(("a", "b"), np.array([-1, 0]), joints, np.eye(2)[[0, 0, 1, 1]], turns, np.zeros((2, 2, 3)))
+    assert len(counting_joints(at_canonical(rig, Canonical(BOX, None, -1, "rest")), 5.0)[0]) == 2
+    assert len(counting_joints(at_canonical(rig, Canonical(BOX, None, 0, "")), 5.0)[0]) == 1
 
 
 def test_velocities_never_cross_a_cut():

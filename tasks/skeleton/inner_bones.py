@@ -59,11 +59,20 @@ class Bones:
             if error > best:
                 ahead, speed = new.transforms, _SLOWEST
             else:
-                ahead = new.transforms + speed * (new.transforms - bones.transforms)
-                ahead = rigid.make(project_so3(ahead[..., :3]), ahead[..., 3])
+                ahead = new.beyond(bones.transforms, speed)
                 speed, best = min(_FASTEST, speed + _FASTER), error
             bones = new
         return bones
+
+    def beyond(self, before: np.ndarray, speed: float) -> np.ndarray:
+        """Transforms extrapolated from others (F, B, 3, 4): each bone's turn, and the path of the centre of what it
+        moves. About the origin instead, a small turn would be a long way off it."""
+        mass = self.weights.sum(axis=0, dtype=np.float64)[:, None]
+        centres = np.where(mass > 0.0, self.weights.T @ self.rest / np.where(mass > 0.0, mass, 1.0), 0.0)
+        paths = rigid.apply(self.transforms, centres)
+        paths = paths + speed * (paths - rigid.apply(before, centres))
+        turns = project_so3(self.transforms[..., :3] + speed * (self.transforms[..., :3] - before[..., :3]))
+        return rigid.make(turns, paths - (turns @ centres[..., None])[..., 0])
 
     def error(self) -> float:
         """Vertex RMSE."""

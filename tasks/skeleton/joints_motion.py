@@ -11,7 +11,6 @@ from tasks.skeleton.body import Body, few_bones
 from tasks.skeleton.curve_weights import onto_surface, sampled, thin
 from tasks.skeleton.inner_bones import Bones
 from tasks.skeleton.linking import better_posed, by_curve, by_motion, tree_residuals
-from tasks.skeleton.place import near_origin
 from tasks.skeleton.refit import spread_weights
 from tasks.skeleton.symmetry import find_mirror
 from tasks.skeleton.tree import joint_names
@@ -68,7 +67,6 @@ def joints_by_motion(
     SSDR once the bones are chosen; refits: rounds of refitting; influences: most joints a point may follow. Lengths are
     shares of the bounding-box diagonal.
     """
-    train, canonical, skinning, surface, curve, origin = near_origin(train, canonical, skinning, surface, curve)
     chosen = thin(canonical, surface, curve, _POINTS)
     carry, mirror = onto_surface(sampled(canonical, chosen), surface), find_mirror(surface) if symmetric else None
     body = Body(surface, curve, carry, diagonal(canonical.points), mirror)
@@ -83,7 +81,7 @@ def joints_by_motion(
     if len(watched.chosen) < len(canonical.points):
         seen = train.points[watched.more]
         weights = spread_weights(seen, canonical.points, fit.parents, joints, watched.chosen, weights, influences)
-    return Skeleton(joint_names(len(joints)), fit.parents, joints.astype(np.float32) + origin, weights)
+    return Skeleton(joint_names(len(joints)), fit.parents, joints.astype(np.float32), weights)
 
 
 def _fitted(

@@ -10,11 +10,10 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 from tasks.geometry import kinematics, rigid
-from tasks.geometry.measure import vertex_rmse
+from tasks.geometry.measure import diagonal, vertex_rmse
 from tasks.geometry.rotations import from_rotation_vector, geodesic
 from tasks.geometry.skinning import skin
 from tasks.geometry.sparse_weights import fit_weights
-from tasks.skeleton import joints_motion
 from tasks.skeleton.articulation import centres, off_hinges
 from tasks.skeleton.body import Body
 from tasks.skeleton.curve_weights import onto_surface
@@ -60,32 +59,53 @@ def test_a_ball_joint_is_found(topology):
     assert lbs_error(shape, skeleton) < 2e-3
 
 
-def test_a_shape_far_from_the_origin_is_brought_near_before_bones_are_extrapolated(monkeypatch):
-    """Extrapolated as a turn about the origin and a shift, bones a thousand lengths away from it overshot."""
-    shape, far = ball_joint(), np.array([2000.0, -800.0, 1500.0], np.float32)
-    near = find(shape)
+def placed(shape: Bending, scale: float, offset: np.ndarray):
+    """The inputs of ``joints_by_motion`` under x -> scale x + offset."""
+
+    def place(points: np.ndarray) -> np.ndarray:
+        return (scale * points.astype(np.float64) + offset).astype(np.float32)
+
     transforms = shape.skinning.transforms.astype(np.float64)
-    transforms[..., 3] += far - transforms[..., :3] @ far
-    moved = (
-        replace(shape.motion, points=shape.motion.points + far),
-        replace(shape.canonical, points=shape.canonical.points + far),
-        replace(shape.skinning, rest=shape.skinning.rest + far, transforms=transforms.astype(np.float32)),
-        replace(shape.surface, vertices=shape.surface.vertices + far),
-        replace(shape.curve, nodes=shape.curve.nodes + far),
+    transforms[..., 3] = scale * transforms[..., 3] + offset - transforms[..., :3] @ offset
+    return (
+        replace(shape.motion, points=place(shape.motion.points)),
+        replace(shape.canonical, points=place(shape.canonical.points)),
+        replace(shape.skinning, rest=place(shape.skinning.rest), transforms=transforms.astype(np.float32)),
+        replace(shape.surface, vertices=place(shape.surface.vertices)),
+        replace(shape.curve, nodes=place(shape.curve.nodes)),
     )
-    seen = []
 
-    def few_bones(bones: Bones, *rest, **settings) -> Bones:
-        seen.append(vertex_rmse(skin(bones.rest, bones.weights, bones.transforms), bones.paths))
-        assert np.abs(bones.rest).max() < 3.0
-        return chosen(bones, *rest, **settings)
 
-    chosen = joints_motion.few_bones
-    monkeypatch.setattr(joints_motion, "few_bones", few_bones)
-    skeleton = joints_by_motion(*moved, **SETTINGS)
-    assert seen[0] < 2e-3  # of float32 coordinates up to 2,700
-    np.testing.assert_array_equal(skeleton.parents, near.parents)
-    np.testing.assert_allclose(skeleton.joints - far, near.joints, atol=0.02)
+@pytest.mark.parametrize(
+    ("diagonals", "scale", "near"),
+    [(1, 1.0, 1e-4), (10, 1.0, 1e-4), (1000, 1.0, 1e-3), (0, 1e-3, 1e-4), (0, 1e3, 1e-4)],
+)
+def test_neither_place_nor_unit_matters(diagonals, scale, near):
+    """But for what float32 coordinates of a thousand lengths round off."""
+    shape = ball_joint()
+    offset = diagonals * diagonal(shape.canonical.points) * np.array([0.6, -0.48, 0.64])
+    here, there = find(shape), joints_by_motion(*placed(shape, scale, offset), **SETTINGS)
+    np.testing.assert_array_equal(there.parents, here.parents)
+    np.testing.assert_allclose(
+        (there.joints - offset) / scale, here.joints, atol=near * diagonal(shape.canonical.points)
+    )
+
+
+def test_bones_improve_alike_wherever_the_origin_is():
+    """Extrapolated as a turn about the origin and a shift, bones a thousand lengths away from it overshot."""
+    rng = np.random.default_rng(0)
+    rest, paths = rng.normal(size=(60, 3)), []
+    for turn in rng.uniform(-0.3, 0.3, (20, 2, 3)):
+        a, b = from_rotation_vector(turn)
+        paths.append(np.where(rest[:, :1] < 0.0, rest @ a.T, rest @ b.T))
+    paths, weights = np.array(paths) + 0.05 * rng.normal(size=(20, 60, 3)), rng.dirichlet(np.ones(3), 60)
+    start = rigid.make(from_rotation_vector(rng.uniform(-0.3, 0.3, (20, 3, 3))), np.zeros((20, 3, 3)))
+    far = np.array([2000.0, -800.0, 1500.0])
+    moved = rigid.make(start[..., :3], far - start[..., :3] @ far)
+    here = Bones(rest, paths, weights, start, 3).improve(8)
+    there = Bones(rest + far, paths + far, weights, moved, 3).improve(8)
+    np.testing.assert_allclose(there.weights, here.weights, atol=1e-4)
+    np.testing.assert_allclose(there.transforms[..., :3], here.transforms[..., :3], atol=1e-4)
 
 
 def test_a_hinge_is_found_though_it_is_free_along_its_axis():

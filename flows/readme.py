@@ -33,6 +33,7 @@ GARMENTS = {
     "Bone kernel (kernel regression by bone, settings by left-out clips)": "bone_kernel",
     "Bone response (linear filter by bone)": "bone_response",
     "Part kernel + cloth (simulated where the kernel does not know)": "part_cloth",
+    "PartMM+ + cloth (the same about what is matched)": "partmm_cloth",
 }
 MATCHED = {"FullMM": "fullmm", "PartMM": "partmm", "PartMM+": "partmm_plus", "Part kernel": "part_kernel"}
 ANIMALS = {"LBS": "robust_lbs", "BBW": "bbw", "MLP": "mlp", "GRU": "gru", **MATCHED}

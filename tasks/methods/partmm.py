@@ -28,6 +28,7 @@ def animate(
     ],
     mirror: bool,
     sources: Annotated[int, "[0, inf)"],
+    every: Annotated[int, "[1, inf)", "sources or every == 1: 1 without sources (windows are of all frames)"],
 ) -> Animation:
     """Poses -> points by partwise motion matching (GaussiAnimate 3.3, eq. 7-10 and alg. 1), then skinning by W.
 
@@ -44,11 +45,12 @@ def animate(
     mirror: match the training clips' mirror images as well, where the character is symmetric.
     sources: instead of the mean of windows, blend as many training frames, those whose pose with its past comes
     nearest, by the shares that predict the query's pose from theirs (:mod:`tasks.motion.affine`); 0 is the paper's.
+    every: of which only every so many-th of a clip is a candidate: neighbours say the same.
 
     Clips of the query shorter than a patch are padded with their last pose. Raises InputError for poses of another
     skeleton, matrices that are no rotations, and training clips all shorter than a patch.
     """
-    way = Way(k, patch, levels, lambda_, temperature, represent, align, dynamics, shrink, mirror, sources)
+    way = Way(k, patch, levels, lambda_, temperature, represent, align, dynamics, shrink, mirror, sources, every)
     found = match(training, query, way)
     points = skin(training.skinning.rest, training.skinning.weights, found.bones)
     return Animation(

@@ -8,7 +8,7 @@ may get a negative one. Every frame still is a sum of known training frames.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 
@@ -33,10 +33,12 @@ BLAS_ALONE = 2**18  # multiplications up to which OpenBLAS stays in its caller's
 
 @dataclass(frozen=True)
 class Space:
-    """Where poses of one part with their past are compared. frames: (F, R) the training frames, in units of the median
-    distance between them; basis: (D, R) that brings descriptions there; weights: (J,) of the joints."""
+    """Where poses of one part with their past are compared. frames: (F, R) of the training frames ``index``, (F,), in
+    units of the median distance between them; basis: (D, R) that brings descriptions there; weights: (J,) of the
+    joints."""
 
     frames: np.ndarray
+    index: np.ndarray
     basis: np.ndarray
     weights: np.ndarray
 
@@ -45,9 +47,17 @@ class Space:
         """(R, F): frames innermost, for vector units."""
         return np.ascontiguousarray(self.frames.T)
 
+    def without(self, frames: np.ndarray) -> Space:
+        """The same, some training frames left out."""
+        kept = ~np.isin(self.index, frames)
+        return replace(self, frames=self.frames[kept], index=self.index[kept])
 
-def space(keys: Keys, weights: np.ndarray) -> Space:
-    """The space of a part's training frames. weights: (J,) how much each joint says."""
+
+def space(keys: Keys, weights: np.ndarray, every: int = 1) -> Space:
+    """The space of a part's training frames, of each clip's every so many-th. weights: (J,) how much each joint says.
+
+    Neighbouring frames say nearly the same: of a given number of sources, fewer of each moment come from more moments.
+    """
     now, back = _now(keys, weights), _back(keys)
     some = np.unique(np.linspace(0, len(now) - 1, min(SAMPLE, len(now))).round().astype(int))
     told = now[back[some]].reshape(len(some), -1)
@@ -58,7 +68,8 @@ def space(keys: Keys, weights: np.ndarray) -> Space:
     _squared_distances(told, np.ascontiguousarray(told.T), apart)
     unit = float(np.sqrt(np.median(apart[apart > 0]))) if (apart > 0).any() else 1.0
     basis = np.ascontiguousarray(basis / unit)
-    return Space(_described(now, back, basis), basis, weights)
+    index = np.concatenate([np.arange(a, b, every) for a, b in pairwise(keys.clip_start)])
+    return Space(_described(now, back[index], basis), index.astype(np.int32), basis, weights)
 
 
 def describe(keys: Keys, known: Space) -> np.ndarray:
@@ -98,19 +109,20 @@ def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def nearest_moments(asked: np.ndarray, known: Space, most: int) -> Sources:
     """The ``most`` training frames whose poses with their past lie nearest to each frame's, (T, R), and the shares by
-    which theirs predict it."""
+    which theirs predict it; with the variance of that prediction."""
     most = min(most, len(known.frames))
     near, share = np.empty((len(asked), most), np.int32), np.empty((len(asked), most))
+    variance = np.empty(len(asked))
 
     def work(a: int, b: int) -> None:
         far = np.empty((b - a, len(known.frames)))
         _squared_distances(asked[a:b], known.columns, far)
         near[a:b] = np.sort(np.argpartition(far, most - 1, axis=1)[:, :most], axis=1)
         to = matern(np.take_along_axis(far, near[a:b], 1) / WIDTH**2)
-        _kriging(known.frames, near[a:b], to, share[a:b])
+        _kriging(known.frames, near[a:b], to, share[a:b], variance[a:b])
 
     for_chunks(work, len(asked), CHUNK)
-    return Sources(near, share, np.full(len(near), most))
+    return Sources(known.index[near], share, np.full(len(near), most), variance)
 
 
 @njit(cache=True, nogil=True)
@@ -131,8 +143,9 @@ def _squared_distances(asked, columns, out):
 
 
 @njit(cache=True, nogil=True)
-def _kriging(frames, near, to, share):
-    """Shares w that sum to one and minimise the variance of sum_m w_m y(frame m) - y(asked), row by row.
+def _kriging(frames, near, to, share, variance):
+    """Shares w that sum to one and minimise the variance of sum_m w_m y(frame m) - y(asked), row by row, and what it
+    comes to where the kernel's own is one.
 
     With U^T U = K + ridge I, columns of U^-T [to, 1] stand beside U while it is made: one pass for all.
     """
@@ -164,8 +177,11 @@ def _kriging(frames, near, to, share):
                 b -= system[i, j] * system[j, most + 1]
             system[i, most], system[i, most + 1] = a / system[i, i], b / system[i, i]
         told, ones = system[:, most].sum(), system[:, most + 1].sum()
+        level = (1.0 - told) / ones
+        variance[t] = 1.0 + level
         for i in range(most):
-            share[t, i] = system[i, most] + (1.0 - told) / ones * system[i, most + 1]
+            share[t, i] = system[i, most] + level * system[i, most + 1]
+            variance[t] -= share[t, i] * to[t, i]
 
 
 @njit(cache=True, nogil=True)

@@ -18,11 +18,13 @@ NEGLIGIBLE = 1e-4  # sources of a smaller share are dropped: a tenth of a millim
 @dataclass(frozen=True)
 class Sources:
     """The training frames that each query frame is blended of. frame: (T, M) int32; share: (T, M) float64, rows sum to
-    one; count: (T,) how many of the M are in use."""
+    one; count: (T,) how many of the M are in use; variance: (T,) of what they predict where that is known, 1 is to know
+    nothing."""
 
     frame: np.ndarray
     share: np.ndarray
     count: np.ndarray
+    variance: np.ndarray | None = None
 
 
 @dataclass(frozen=True)

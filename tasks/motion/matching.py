@@ -36,15 +36,18 @@ class Way:
     shrink: bool
     mirror: bool
     sources: int
+    every: int
 
 
 @dataclass(frozen=True)
 class Matched:
-    """bones: (F, B, 3, 4) on canonical points; sources: (F, P, k) int32; distance: (F, P) mean angle in radians."""
+    """bones: (F, B, 3, 4) on canonical points; sources: (F, P, k) int32; distance: (F, P) mean angle in radians;
+    variance: (F, P) of what each part's sources predict, 1 is to know nothing (zeros for a softmax)."""
 
     bones: np.ndarray
     sources: np.ndarray
     distance: np.ndarray
+    variance: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -95,7 +98,7 @@ def prepare(training: Training, way: Way) -> Prepared:
         mine = known.to_part(values[:, follows], part, way.represent) if own else values
         which = np.arange(len(follows)) if own else follows
         heavy = joint_weights(known, part, known.key_joints(part))
-        told = space(known.keys(part, way.dynamics), heavy) if way.sources else None
+        told = space(known.keys(part, way.dynamics), heavy, way.every) if way.sources else None
         moving = known.part_motion(part, way.represent) if align else None
         parts.append(PartStore(follows, affinity[follows], mine, which, moving, heavy, told))
     ready = Prepared(known, way, tuple(parts), frames)
@@ -111,21 +114,28 @@ def match(training: Training, query: Poses, way: Way) -> Matched:
     return match_prepared(prepare(training, way), query)
 
 
-def match_prepared(ready: Prepared, query: Poses) -> Matched:
-    """The same with a database that is ready, for poses that were checked."""
+def match_prepared(ready: Prepared, query: Poses, *, left_out: bool = False) -> Matched:
+    """The same with a database that is ready, for poses that were checked. left_out: the query are the training clips,
+    each to be matched with the others."""
     done, way = [], ready.way
     for clip in range(len(query.clip_start) - 1):
         asked = Posed(ready.known.training, one_clip(query, clip, way.patch), ready.known)
-        frames, sources, distance = _match_clip(asked, ready)
+        frames, *more = _match_clip(asked, ready, skip=of_clip(ready, clip) if left_out else ())
         length = int(query.clip_start[clip + 1] - query.clip_start[clip])
-        done.append([x[:length] for x in (asked.decode(believed(ready, frames), way.represent), sources, distance)])
-    bones, sources, distance = (np.concatenate(x) for x in zip(*done, strict=True))
+        done.append([x[:length] for x in (asked.decode(believed(ready, frames), way.represent), *more)])
+    bones, sources, distance, variance = (np.concatenate(x) for x in zip(*done, strict=True))
     sources %= ready.frames  # an image counts as the frame that it is the image of
-    return Matched(bones.astype(np.float32), sources, distance.astype(np.float32))
+    return Matched(bones.astype(np.float32), sources, distance.astype(np.float32), variance)
 
 
-def _match_clip(asked: Posed, ready: Prepared, skip: tuple[int, ...] = ()) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """One clip: frames of bones (F, B, 3, 4), sources (F, P, k), distance (F, P). skip: training clips left out."""
+def of_clip(ready: Prepared, clip: int) -> tuple[int, ...]:
+    """A training clip and its image among the clips that are matched."""
+    start = ready.known.poses.clip_start
+    return tuple(range(clip, len(start) - 1, int(np.searchsorted(start, ready.frames))))
+
+
+def _match_clip(asked: Posed, ready: Prepared, skip: tuple[int, ...] = ()) -> list[np.ndarray]:
+    """One clip: frames of bones (F, B, 3, 4), sources (F, P, k), distance and variance (F, P). skip: clips left out."""
     frames, way, known = len(asked.world), ready.way, ready.known
     lengths = np.delete(np.diff(known.poses.clip_start), list(skip))
     strides = _strides(min(frames, int(lengths.max())), way.patch, way.levels)
@@ -134,13 +144,17 @@ def _match_clip(asked: Posed, ready: Prepared, skip: tuple[int, ...] = ()) -> tu
         keys = asked.keys(part, way.dynamics), known.keys(part, way.dynamics)
         found = nearest_windows(*keys, k=way.k, patch=way.patch, strides=strides, skip=skip)
         if way.sources:
-            known_moments = ready.parts[part].space
-            rows.append(nearest_moments(describe(keys[0], known_moments), known_moments, way.sources))
+            moments = ready.parts[part].space
+            if skip:
+                start = known.poses.clip_start
+                moments = moments.without(np.concatenate([np.arange(start[c], start[c + 1]) for c in skip]))
+            rows.append(nearest_moments(describe(keys[0], moments), moments, way.sources))
         else:
             rows.append(gather(found, strides, patch=way.patch, lambda_=way.lambda_, temperature=way.temperature))
         distance.append(_per_frame(found.distance[-1, :, 0], frames, way.patch))
     sources = np.stack([strongest(row, way.k) for row in rows], 1)
-    return merged(asked, ready, rows), sources, np.stack(distance, 1)
+    variance = np.stack([np.zeros(frames) if row.variance is None else row.variance for row in rows], 1)
+    return [merged(asked, ready, rows), sources, np.stack(distance, 1), variance]
 
 
 def merged(asked: Posed, ready: Prepared, rows: list[Sources]) -> np.ndarray:
@@ -174,7 +188,7 @@ def _reliability(ready: Prepared, values: np.ndarray) -> np.ndarray:
     agree, size = np.zeros(len(unit)), np.zeros(len(unit))
     real = int(np.searchsorted(poses.clip_start, ready.frames))  # clips; their images follow in the same order
     for clip, (a, b) in enumerate(pairwise(poses.clip_start[: real + 1])):
-        out = tuple(range(clip, len(lengths), real))
+        out = of_clip(ready, clip)
         if real < 2 or np.delete(lengths, out).max() < patch:
             continue
         asked = Posed(training, one_clip(poses, clip, patch), ready.known)

@@ -65,7 +65,7 @@ class Online:
             for part in range(len(ready.parts))
         ]
         self._spaces = [
-            space(search.database, store.heavy) if way.sources else None
+            space(search.database, store.heavy, way.every) if way.sources else None
             for search, store in zip(self._searches, ready.parts, strict=True)
         ]
         skinning = known.training.skinning

@@ -30,6 +30,7 @@ PAPER = {
     "shrink": False,
     "mirror": False,
     "sources": 0,
+    "every": 1,
 }
 WAYS = [
     PAPER,

@@ -44,6 +44,7 @@ PLUS = {
     "shrink": True,
     "mirror": False,
     "sources": 0,
+    "every": 1,
 }
 
 

@@ -21,10 +21,11 @@ from tasks.values import Canonical, Metrics, Motion, Skinning
 # From quick to thorough: changes to the settings of the decomposition that trade error for time. The first that
 # reaches the peer's error is what ``time_to_peer_rmse_ratio`` times; the settings as shipped come last.
 EFFORTS = (
-    *({"surplus": 1.0, "iterations": rounds} for rounds in (0, 1, 2, 3)),
-    *({"surplus": 1.0, "iterations": rounds, "points_per_bone": 60} for rounds in (5, 8)),
-    {"surplus": 1.25, "iterations": 2, "points_per_bone": 60},
-    *({"iterations": rounds, "points_per_bone": 60} for rounds in (2, 8)),
+    *(
+        {"surplus": 0, "smoothness": 0.0, "points_per_bone": 50, "iterations": rounds, "polish": polish}
+        for rounds, polish in ((2, 1), (3, 1), (4, 1), (6, 1), (8, 1), (8, 2), (12, 3))
+    ),
+    {"surplus": 20, "polish": 3, "points_per_bone": 60},
     {},
 )
 

@@ -16,7 +16,7 @@ from tasks.bones.products import product
 from tasks.bones.trajectories import Trajectories
 from tasks.geometry.parallel import for_chunks
 
-_POINTS = 512  # points a thread takes at a time
+_POINTS = 256  # points a thread takes at a time
 
 
 def refine(

@@ -34,7 +34,6 @@ _WARM_UP = 4  # rounds with surplus bones
 _REMOVED = 0.12  # part of the bones removed at a time
 _BETWEEN = 2  # rounds after each removal
 _SHARED = 0.1  # overlap above which two bones are not removed together: each may be what replaces the other
-_FINISH = 3  # rounds on all points
 _FIRST_EXCHANGES = 3  # exchanges a point makes in the first round of a run
 
 
@@ -44,8 +43,9 @@ def ssdr(
     clusters: Clusters,
     *,
     influences: Annotated[int, "[1, inf)"],
-    surplus: Annotated[float, "[1, inf)"],
+    surplus: Annotated[int, "[0, inf)"],
     iterations: Annotated[int, "[0, inf)"],
+    polish: Annotated[int, "[1, inf)"],
     points_per_bone: Annotated[int, "[6, inf)"],
     smoothness: Annotated[float, "[0, inf)"],
     locality: Annotated[float, "[0, inf)"],
@@ -57,8 +57,8 @@ def ssdr(
     """Weights W (N, B), rest points v (N, 3) and rigid transforms T (F, B, 3, 4) that minimise
     sum |sum_b w_nb T_fb v_n - x_fn|^2.
 
-    influences: most bones a point may have; surplus: bones to start with, as a multiple of those wanted;
-    iterations: rounds once the surplus is gone; points_per_bone: points that take part until the last rounds;
+    influences: most bones a point may have; surplus: bones at the start beyond those wanted; iterations: rounds
+    once the surplus is gone; polish: rounds on all points after those; points_per_bone: points that take part before;
     smoothness: weight of the squared difference to the neighbours' mean weights, against squared errors relative to
     the shape's radius; locality: pull to near bones, sum_b w_nb |v_n - centre_b|^2 (in radii) per degree of evidence,
     i.e. times the clusters' squared error over F: few frames need it, many hardly feel it; firmness: frames that the
@@ -80,14 +80,14 @@ def ssdr(
     paths = compress(train.points, canonical.points, tolerance=compression * coarse, sample=_thinned(chosen))
     near_first = locality * (coarse / paths.alignment.scale) ** 2 / train.frames
     part = paths.take(chosen)
-    bones = _start(part, clusters.labels[chosen], math.ceil(surplus * wanted), influences)
-    history = _alternate(bones, _WARM_UP if len(bones.offsets) > wanted else 0, locality=near_first)
+    bones = _start(part, clusters.labels[chosen], wanted + surplus, influences)
+    usual = {"locality": near_first, "firmness": firmness}
+    history = _alternate(bones, _WARM_UP if len(bones.offsets) > wanted else 0, **usual)
     while len(bones.offsets) > wanted:
         _remove(bones, wanted)
-        history += _alternate(bones, _BETWEEN, locality=near_first)
-    usual = {"locality": near_first, "firmness": firmness}  # the rest shape waits: surplus bones bend it
+        history += _alternate(bones, _BETWEEN, **usual)
     history += _alternate(bones, iterations, **usual)
-    history += _finish(train, canonical, paths, bones, sound, smoothness, prune, usual)
+    history += _finish(train, canonical, paths, bones, polish, sound, smoothness, prune, usual)
     rest = paths.alignment.canonical(bones.paths.rest).astype(np.float32)
     moved = paths.alignment.to_world(bones.offsets).astype(np.float32)
     reached = skinned_rmse(rest, bones.index, bones.value.astype(np.float32), moved, train.points)
@@ -137,10 +137,10 @@ def _alternate(
     sound: np.ndarray | None = None,
     smoothness: float = 0.0,
     locality: float,
-    firmness: float | None = None,
+    firmness: float,
     prune: float = 0.0,
 ) -> list[float]:
-    """Rounds of weights, transforms and, given a firmness, rest points, in place. Returns the vertex RMSE after each.
+    """Rounds of weights, transforms and rest points, in place. Returns the vertex RMSE after each.
 
     The extrapolation grows while the error falls and starts anew when it rises; the rest shape follows the transforms
     that were found, not the extrapolated ones, which it would run after. Points look for other bones in every second
@@ -169,8 +169,7 @@ def _alternate(
         before, bones.offsets = bones.offsets, guess
         step = 0.0 if history and error > history[-1] else min(0.95, max(0.4, step + 0.1))
         history.append(error)
-        if firmness is not None:
-            bones.paths = refine(paths, guess, bones.index, bones.value, bones.home, firmness)
+        bones.paths = refine(paths, guess, bones.index, bones.value, bones.home, firmness)
     return history
 
 
@@ -179,6 +178,7 @@ def _finish(
     canonical: Canonical,
     paths: Trajectories,
     bones: _Bones,
+    rounds: int,
     sound: np.ndarray,
     smoothness: float,
     prune: float,
@@ -189,7 +189,7 @@ def _finish(
     bones.index, bones.value = bones.index[near], bones.value[near]
     bones.paths, bones.home = paths, paths.rest
     graph = moving_together(train.points, canonical.points, canonical.faces) if smoothness > 0 else None
-    history = _alternate(bones, _FINISH, graph=graph, sound=sound, smoothness=smoothness, prune=prune, **usual)
+    history = _alternate(bones, rounds, graph=graph, sound=sound, smoothness=smoothness, prune=prune, **usual)
     k, y = transforms.sums(bones.paths, _counted(bones.index, sound), bones.value, len(bones.offsets))
     transforms.sweep(k, y, bones.offsets, _SETTLE)
     return history

@@ -18,8 +18,8 @@ from tasks.bones.rotation import nearest_rotation
 from tasks.bones.trajectories import Trajectories
 from tasks.geometry.parallel import for_chunks
 
-_POINTS = 2048  # points whose sums are taken together
-_FRAMES = 64  # frames solved together: enough for long inner loops, and their offsets fit the second-level cache
+_POINTS = 1024  # points whose sums are taken together
+_FRAMES = 32  # frames solved together: enough for long inner loops, and their offsets fit the second-level cache
 _WORTH = 2048  # rotations below which a thread is not worth its start
 _HOLD = 1e-7  # how firmly a rotation that the points do not determine keeps its last value
 

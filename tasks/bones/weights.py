@@ -22,7 +22,7 @@ from tasks.geometry.parallel import for_chunks
 from tasks.geometry.simplex import solve
 from tasks.geometry.simplex import value as value_of
 
-POINTS = 512  # points a thread takes at a time
+POINTS = 256  # points a thread takes at a time
 TILE = 8  # points whose correlations with all bones are computed together
 _PAIRS = [(i, j) for i in range(4) for j in range(i, 4)]  # the upper triangle, row by row
 _GAIN = 1e-4  # relative gain below which an exchange is not worth its solve

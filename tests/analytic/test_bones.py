@@ -19,8 +19,9 @@ from tasks.values import Canonical, Clusters, Motion, same
 CLUSTERING = {"max_bones": 12, "count": "auto", "slack": 0.02, "exact": 1e-4, "rounds": 4, "seed": 0}
 SSDR = {
     "influences": 4,
-    "surplus": 1.6,
+    "surplus": 40,
     "iterations": 20,
+    "polish": 8,
     "points_per_bone": 80,
     "smoothness": 0.0,
     "locality": 0.0,

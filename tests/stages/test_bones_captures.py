@@ -19,8 +19,9 @@ from tasks.values import Canonical, Motion, Skinning
 CLUSTERING = {"max_bones": 20, "count": "fixed", "slack": 0.02, "exact": 1e-4, "rounds": 4, "seed": 0}
 SSDR = {
     "influences": 4,
-    "surplus": 1.6,
+    "surplus": 40,
     "iterations": 20,
+    "polish": 8,
     "points_per_bone": 120,
     "smoothness": 1e-5,
     "locality": 8.0,

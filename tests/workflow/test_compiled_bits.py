@@ -37,7 +37,7 @@ motion = creature.load(subject="animal", frames_per_clip=16, vertices=3000, soft
 canonical = Canonical(motion.points[0], motion.faces, 0, "first")
 clusters = cluster(motion, canonical, max_bones=20, count="auto", slack=0.02, exact=1e-4, rounds=4, seed=0)
 say("clusters", clusters.labels, clusters.curve_error)
-skinning = ssdr(motion, canonical, clusters, influences=4, surplus=1.6, iterations=4, points_per_bone=120,
+skinning = ssdr(motion, canonical, clusters, influences=4, surplus=12, iterations=4, polish=3, points_per_bone=120,
                 smoothness=1e-5, locality=8.0, firmness=1.0, compression=0.06, prune=0.0, seed=0)
 say("bones", skinning.weights, skinning.transforms)
 images = drawn("numba", *scene(torch.float32))

@@ -18,6 +18,11 @@ UNSEEN = ("rmse_pct", "rmse", "rmse_coordinate")
 MOTION = ("velocity_rmse", "speed_ratio", "max_error")
 CONFIDENCE = ("confidence_spearman", "outside_pct")
 DISTANCE = "query_distance"
+PART_ERROR = "part_rmse"
+PART_ERROR_OF = (  # side by side, where they were run
+    *("robust_lbs", "mlp", "gru", "fullmm", "partmm"),
+    *("partmm_plus", "part_kernel", "part_cloth", "partmm_cloth"),
+)
 LEFT_OUT = ("rmse_spread", "rmse_left_out", "rmse_left_out_spread")
 VIEWS = ("psnr", "ssim", "flip", "lpips", "ssim_down")
 PATHS = ("path_pct", "path_start_pct")
@@ -74,6 +79,10 @@ BY_PART = "Distance of the unseen poses from the database, by clip and part"
 ON_DISTANCE = (
     "Mean over a part's joints of the angle to the nearest windows of the training clips; differences of the root's "
     "gravity and motion count as angles too, by the weight confidence.dynamics. It is the same for all methods."
+)
+ON_PART_ERROR = (
+    "A vertex belongs to the part that holds most of its skin weight. How far each part's unseen poses lie from the "
+    "database stands above."
 )
 ON_LEFT_OUT = (
     "Trained {runs} times, each time without one training clip: how far that moves the error on the unseen clips, and "
@@ -138,7 +147,7 @@ def _result_tables(cases: list[Case], rows, settings: dict, notes: list[str], pa
         tables.append(build(rows, title="Motion of the same results", metrics=MOTION, notes=[], **common))
     if has & set(CONFIDENCE):
         tables.append(build(rows, title="Confidence", metrics=CONFIDENCE, notes=[ON_CONFIDENCE], **plain))
-    tables += _distance_tables(cases, rows, plain)
+    tables += [*_distance_tables(cases, rows, plain), *_part_error_tables(rows, common)]
     if has & set(LEFT_OUT):
         notes = [ON_LEFT_OUT.format(runs=cases[0].config["evaluate"]["left_out"])]
         tables.append(build(rows, title="One training clip left out", metrics=LEFT_OUT, notes=notes, **plain))
@@ -159,6 +168,26 @@ def _distance_tables(cases: list[Case], rows, common: dict) -> list:
         return []
     made = unranked(build(found, title=BY_PART, metrics=[DISTANCE], notes=[ON_DISTANCE], **common | {"labels": {}}))
     return [replace(made, folded=True)]
+
+
+def _part_error_tables(rows, common: dict) -> list:
+    """Errors by clip and part, a table for each subject, whose columns are methods."""
+    from tasks.reporting.tables import build, unranked
+
+    found = _by_case(
+        rows[rows["metric"].str.startswith(f"{PART_ERROR}@") & (rows["variant"] == "")].assign(of=lambda r: r["method"])
+    )
+    order = {method: place for place, method in enumerate(PART_ERROR_OF)}
+    found = found[found["of"].isin(order)].sort_values("of", key=lambda of: of.map(order), kind="stable")
+    if found["of"].nunique() < 2:
+        return []
+    tables = []
+    for (_, subject), own in found.groupby(["dataset", "subject"], sort=False):
+        title, turned = f"Error by clip and part: {subject}", own.assign(dataset=own["of"], subject="")
+        plain = common | {"data_status": {}, "stands_for": {}, "baselines": []}
+        made = unranked(build(turned, title=title, metrics=[PART_ERROR], notes=[ON_PART_ERROR], **plain))
+        tables.append(replace(made, folded=True))
+    return tables
 
 
 def _rig_tables(cases: list[Case], rows, remarks: list[str], common: dict) -> list:

@@ -66,6 +66,7 @@ def plan(case: Case, graph: Graph) -> Planned:
         nodes |= _confidence(config, add, nodes)
         seen = {n: nodes[n] for n in ("confidence", "animation", "test")}
         metrics.append(add("evaluate", schema.EVALUATE_CONFIDENCE, {}, "metrics", **seen))
+        metrics += _by_part(config, add, nodes)
         metrics += _left_out(case, add, nodes)
     if config["pipeline"] == "drive":
         nodes |= _driven(config, add, nodes)
@@ -180,6 +181,18 @@ def _confidence(config: dict, add, nodes: dict[str, Output]) -> dict[str, Output
     return {
         "confidence": add("confidence", schema.CONFIDENCE, config["confidence"], "confidence", **inputs)["confidence"]
     }
+
+
+def _by_part(config: dict, add, nodes: dict[str, Output]) -> list[Node]:
+    """Errors by clip and part, of data whose skeleton is given: joints found by us have no names that say something.
+    The parts are the same for all methods, those of FullMM, too."""
+    if config["skeleton"]["kind"] != "given":
+        return []
+    kind = {"kind": "auto"} if config["parts"]["kind"] == "whole" else {}
+    settings = config["parts"] | kind | {"affinity": 0.0}
+    parts = add("parts", schema.PARTS, settings, "parts", skeleton=nodes["skeleton"], skinning=nodes["skinning"])
+    inputs = {n: nodes[n] for n in ("animation", "test", "skinning")} | {"parts": parts["parts"]}
+    return [add("evaluate", schema.EVALUATE_PARTS, {}, "metrics", **inputs)]
 
 
 def _left_out(case: Case, add, nodes: dict[str, Output]) -> list[Node]:

@@ -61,6 +61,7 @@ METRICS: dict[str, Metric] = {
     "query_distance": Metric(
         "distance to the database", "angle", "none", "mean over frames and their nearest windows, one part's joints", 1
     ),
+    "part_rmse": Metric("RMSE of a part", "length", "lower", "the same over one part's vertices in one clip"),
     "rmse_spread": Metric("± clip left out", "length", "none", "standard deviation of RMSE, one training clip missing"),
     "rmse_left_out": Metric("RMSE, clips left out", "length", "lower", "mean over training clips, each unseen"),
     "rmse_left_out_spread": Metric("± over these clips", "length", "none", "standard deviation of the same"),

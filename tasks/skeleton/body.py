@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from tasks.geometry.neighbours import adjacency, mesh_edges
 from tasks.skeleton.curve_weights import Interpolation, node_lengths, node_weights
+from tasks.skeleton.division import divide
 from tasks.skeleton.inner_bones import Bones, absence, merge_alike, prune, rigid_pieces
 from tasks.skeleton.symmetry import Mirror
 from tasks.skeleton.tree import to_ends
@@ -61,7 +62,8 @@ def few_bones(
     on_curve = body.on_curve(bones.weights)
     shared = on_curve.T @ (on_curve * node_lengths(body.curve)[:, None])
     bones = merge_alike(bones, np.where(shared > 1e-3 * node_lengths(body.curve).mean(), shared, 0.0), angle)
-    return replace(bones, influences=_AFTER).improve(2 * rounds)
+    bones = replace(bones, influences=_AFTER).improve(2 * rounds)
+    return divide(bones, body.size, angle=angle, at_most=at_most, rounds=rounds)
 
 
 def _pieces(bones: Bones, body: Body) -> np.ndarray:

@@ -18,7 +18,7 @@ _SWEEPS = 2
 _SUPPORT = 0.02  # bones that weigh more than this on a point that the dropped bone also held are looked at again
 _TRACE = 1e-3  # weights below do not count
 _SLOWEST, _FASTEST, _FASTER = 0.4, 0.95, 0.05  # Nesterov's extrapolation: start, most, growth a round
-_SMALLEST = 0.004  # of the diagonal: extent below which a bone's angle would be noise
+SMALLEST = 0.004  # of the diagonal: extent below which a bone's angle would be noise
 _EXACT = 1e-4  # of the diagonal: errors below are as good as none
 
 
@@ -142,7 +142,7 @@ def absence(bones: Bones, which: np.ndarray, size: float) -> np.ndarray:
         centre = mass @ few.rest / mass.sum()
         extent = np.sqrt(mass @ np.sum((few.rest - centre) ** 2, axis=1) / mass.sum())
         lost = max(float(np.sum(then - now[held])), 0.0) / len(bones.paths) / mass.sum()
-        squared = lost / max(extent, _SMALLEST * size) ** 2
+        squared = lost / max(extent, SMALLEST * size) ** 2
         out[i] = np.sqrt(squared), squared * np.sqrt(mass.sum() / len(bones.rest))
     return out
 

@@ -17,6 +17,7 @@ from tasks.geometry.sparse_weights import fit_weights
 from tasks.skeleton.articulation import centres, off_hinges
 from tasks.skeleton.body import Body
 from tasks.skeleton.curve_weights import onto_surface
+from tasks.skeleton.division import divide, peak_angles
 from tasks.skeleton.inner_bones import Bones, prune
 from tasks.skeleton.joints_gradient import joints_by_gradient
 from tasks.skeleton.joints_motion import joints_by_motion
@@ -360,3 +361,34 @@ def test_the_root_is_the_calm_bone_of_the_trunk_not_the_largest_nor_a_calm_leaf(
     areas = np.array([2.0, 2.5, 1.0, 1.0, 1.0, 1.0, 6.0])
     found = Articulation(bones, links, np.zeros((6, 3)), np.zeros(6), np.ones(6), np.zeros((7, 3)), areas)
     assert root_of(found) == 0
+
+
+@pytest.mark.parametrize(("folds", "found"), [(4, 3), (0, 2)])
+def test_a_bone_of_two_segments_is_cut_though_it_folds_in_few_frames_only(folds, found):
+    rng = np.random.default_rng(0)
+    turns = np.zeros((60, 3, 3))
+    turns[:, 1] = rng.uniform(-0.5, 0.5, (60, 3))
+    turns[:folds, 2] = rng.uniform(0.2, 0.4, (folds, 3))
+    shape = Bending(4.0, [0.0, 1.5, 2.7], turns, np.zeros((60, 3)), 0.1)
+    weights = np.stack([shape.weights[:, 0], shape.weights[:, 1:].sum(axis=1)], axis=1)
+    rest = shape.canonical.points.astype(float)
+    bones = Bones(rest, shape.motion.points, weights, shape.transforms[:, :2], 4).improve(8)
+    assert prune(bones, 4.0, knee=1.7, angle=6.0, at_most=10).count == 2
+    cut = divide(bones, 4.0, angle=5.0, at_most=10, rounds=8)
+    assert cut.count == found
+    if folds:
+        assert len(np.unique(cut.weights.argmax(axis=1))) == 3
+        assert cut.error() < 0.3 * bones.error()
+        owner = cut.weights[rest[:, 0] > 2.9].argmax(axis=1)
+        assert (owner == owner[0]).all()
+    assert divide(bones, 4.0, angle=5.0, at_most=2, rounds=8).count == 2
+
+
+def test_skin_that_swells_is_not_cut():
+    """The halves of a tube that grows thick and thin move apart, but lie beside each other and leave the error."""
+    shape = Bending(1.0, [0.0], np.zeros((40, 1, 3)), np.zeros((40, 3)), 0.05)
+    thick = 1.0 + 0.3 * np.sin(np.linspace(0.0, 9.0, 40))[:, None, None]
+    paths = (shape.canonical.points * np.concatenate([np.ones_like(thick), thick, thick], axis=2)).astype(np.float32)
+    bones = Bones(shape.canonical.points.astype(float), paths, shape.weights, shape.transforms, 4)
+    assert peak_angles(bones, 1.0)[0] > np.radians(1.0)
+    assert divide(bones, 1.0, angle=5.0, at_most=10, rounds=8).count == 1

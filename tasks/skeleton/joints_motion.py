@@ -52,9 +52,10 @@ def joints_by_motion(
     refits: Annotated[int, "[0, inf)"],
     influences: Annotated[int, "[1, 16]"],
 ) -> Skeleton:
-    """Few bones that explain the motion (:mod:`tasks.skeleton.inner_bones`), joints where two of them carry the same
-    point along (:mod:`tasks.skeleton.articulation`), a tree over them, then weights and joints refitted to the motion
-    (:mod:`tasks.skeleton.refit`). One joint a bone: it owns the points that its bone moves; no end effectors.
+    """Few bones that explain the motion (:mod:`tasks.skeleton.inner_bones`, :mod:`tasks.skeleton.division`), joints
+    where two of them carry the same point along (:mod:`tasks.skeleton.articulation`), a tree over them, then weights
+    and joints refitted to the motion (:mod:`tasks.skeleton.refit`). One joint a bone: it owns the points that its bone
+    moves; no end effectors.
 
     max_joints: most joints; topology: ``motion`` takes the spanning tree of least joint gap, which is right for
     articulated bodies; ``curve`` keeps the curve's own tree, which does not tangle under cloth and soft tissue;

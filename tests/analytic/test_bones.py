@@ -20,8 +20,8 @@ CLUSTERING = {"max_bones": 12, "count": "auto", "slack": 0.02, "exact": 1e-4, "r
 SSDR = {
     "influences": 4,
     "surplus": 40,
-    "iterations": 20,
-    "polish": 8,
+    "iterations": 14,
+    "polish": 6,
     "points_per_bone": 80,
     "smoothness": 0.0,
     "locality": 0.0,

@@ -20,8 +20,8 @@ CLUSTERING = {"max_bones": 20, "count": "fixed", "slack": 0.02, "exact": 1e-4, "
 SSDR = {
     "influences": 4,
     "surplus": 40,
-    "iterations": 20,
-    "polish": 8,
+    "iterations": 14,
+    "polish": 6,
     "points_per_bone": 120,
     "smoothness": 1e-5,
     "locality": 8.0,

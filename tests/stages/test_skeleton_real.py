@@ -148,7 +148,14 @@ def test_poses_of_a_walking_fox_never_flip(shared_data, fox, skeleton):
     motion = rigged_character.load(path=str(path), fps=24.0, hierarchy="attached", unit="unit")
     walk = next(c for c, name in zip(motion.clips(), motion.clip_names, strict=True) if "Walk" in name)
     poses = fit_poses(motion.take_frames([walk], ["walk"]), fox.canonical, skeleton, **shipped("skeleton.poses"))
-    assert np.degrees(geodesic(poses.rotations[1:], poses.rotations[:-1])).max() < 45.0
+    steps = np.degrees(geodesic(poses.rotations[1:], poses.rotations[:-1]))
+    owned = np.bincount(skeleton.weights.argmax(axis=1), minlength=len(skeleton.joints)) > 0
+    assert np.sum(~owned) <= 1  # a bone that was cut may leave a joint without points of its own, whose turn is open
+    assert steps[:, owned].max() < 45.0
+    transforms = kinematics.forward(skeleton.parents, skeleton.joints, poses.rotations, poses.translations)
+    posed = skin(fox.canonical.points, skeleton.weights, transforms)
+    true = np.linalg.norm(np.diff(motion.take_frames([walk], ["walk"]).points, axis=0), axis=2).max()
+    assert np.linalg.norm(np.diff(posed, axis=0), axis=2).max() < 1.2 * true  # nor does any point jump
 
 
 @pytest.mark.slow
